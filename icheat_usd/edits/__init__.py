@@ -1,0 +1,1 @@
+"""Edits of indirect light: what they are, and what they do to a pair of samples."""

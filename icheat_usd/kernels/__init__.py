@@ -1,0 +1,1 @@
+"""Every Numba kernel of the package, and nothing that is not one."""

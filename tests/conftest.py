@@ -1,0 +1,17 @@
+"""Fixtures that several test folders share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared_scenes() -> Path:
+    """Folder of scenes that this project did not write; tests that need it skip where it is absent."""
+    folder = Path(os.environ.get("ICHEAT_SHARED_SCENES") or Path(__file__).parents[2] / "shared" / "scenes")
+    if not folder.is_dir():
+        pytest.skip(f"no folder of outside scenes at {folder}; set ICHEAT_SHARED_SCENES")
+    return folder
