@@ -1,0 +1,6 @@
+"""The transport operator: building, bounces, compression."""
+
+from icheat_usd.transport.build import Lobe, Transport, build_transport, solve_bounces
+from icheat_usd.transport.sparse import SparseRows
+
+__all__ = ["Lobe", "SparseRows", "Transport", "build_transport", "solve_bounces"]
