@@ -1,0 +1,1 @@
+"""The home of ``pxr``: what a stage holds becomes a snapshot, and edits become opinions."""
