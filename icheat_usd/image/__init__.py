@@ -1,0 +1,1 @@
+"""Images on disk and on screen: textures, films, colour management and comparison."""
