@@ -1,0 +1,120 @@
+"""Direct light at surface points: shadow rays to fill, and their sums."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import parallel_kernel
+from icheat_usd.kernels.lights import sample_analytic, sample_mesh
+from icheat_usd.kernels.random import hash_combine, sobol_pair
+
+
+@parallel_kernel
+def fill_analytic(
+    lights, textures, tables, light, position, normal, shading_normal, instance, first, n_samples, seed, cosine,
+    direction, distance, pdf, radiance,
+):  # fmt: skip
+    """Shadow rays of every point to one light that is no mesh.
+
+    Rows of the outputs are point-major, `n_samples` each. `radiance` holds L / (pdf n_samples),
+    times the shading cosine if `cosine`; zero below either horizon.
+    """
+    for i in prange(position.shape[0]):
+        if instance[i] < 0:
+            continue
+        sequence = hash_combine(hash_combine(hash_combine(seed, 0x11), first + i), light)
+        px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
+        gx, gy, gz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        nx, ny, nz = float(shading_normal[i, 0]), float(shading_normal[i, 1]), float(shading_normal[i, 2])
+        for k in range(n_samples):
+            u1, u2 = sobol_pair(k, sequence)
+            wx, wy, wz, t, p, r, g, b = sample_analytic(
+                lights, textures, tables, light, px, py, pz, nx, ny, nz, float(u1), float(u2)
+            )
+            if p <= 0.0:
+                continue
+            shading_cosine = wx * nx + wy * ny + wz * nz
+            if shading_cosine <= 0.0 or wx * gx + wy * gy + wz * gz <= 0.0:
+                continue
+            weight = 1.0 / (p * n_samples)
+            if cosine:
+                weight *= shading_cosine
+            row = i * n_samples + k
+            direction[row, 0] = wx
+            direction[row, 1] = wy
+            direction[row, 2] = wz
+            distance[row] = t
+            pdf[row] = p
+            radiance[row, 0] = r * weight * lights.radiance[light, 0]
+            radiance[row, 1] = g * weight * lights.radiance[light, 1]
+            radiance[row, 2] = b * weight * lights.radiance[light, 2]
+
+
+@parallel_kernel
+def fill_mesh(
+    lights, tables, light, position, normal, shading_normal, instance, first, n_samples, seed, cosine,
+    direction, distance, pdf, radiance, emissive, barycentric, light_point, light_normal, light_side,
+):  # fmt: skip
+    """Shadow rays of every point to one MESH light; as `fill_analytic`.
+
+    `radiance` lacks the emission of textured triangles, whose rows and places are in `emissive`
+    (-1: no ray) and `barycentric`; `light_normal` is turned to the receiver, `light_side` says from which.
+    """
+    for i in prange(position.shape[0]):
+        if instance[i] < 0:
+            continue
+        sequence = hash_combine(hash_combine(hash_combine(seed, 0x11), first + i), light)
+        px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
+        for k in range(n_samples):
+            u1, u2 = sobol_pair(k, sequence)
+            e, b1, b2, lx, ly, lz, mx, my, mz, p = sample_mesh(lights, tables, light, px, py, pz, float(u1), float(u2))
+            if p <= 0.0:
+                continue
+            dx, dy, dz = lx - px, ly - py, lz - pz
+            t = math.sqrt(dx * dx + dy * dy + dz * dz)
+            wx, wy, wz = dx / t, dy / t, dz / t
+            shading_cosine = wx * shading_normal[i, 0] + wy * shading_normal[i, 1] + wz * shading_normal[i, 2]
+            if shading_cosine <= 0.0 or wx * normal[i, 0] + wy * normal[i, 1] + wz * normal[i, 2] <= 0.0:
+                continue
+            weight = 1.0 / (p * n_samples)
+            if cosine:
+                weight *= shading_cosine
+            row = i * n_samples + k
+            towards = -1.0 if wx * mx + wy * my + wz * mz > 0.0 else 1.0
+            direction[row, 0] = wx
+            direction[row, 1] = wy
+            direction[row, 2] = wz
+            distance[row] = t
+            pdf[row] = p
+            emissive[row] = e
+            barycentric[row, 0] = b1
+            barycentric[row, 1] = b2
+            light_point[row, 0] = lx
+            light_point[row, 1] = ly
+            light_point[row, 2] = lz
+            light_normal[row, 0] = towards * mx
+            light_normal[row, 1] = towards * my
+            light_normal[row, 2] = towards * mz
+            light_side[row] = 0 if towards > 0.0 else 1
+            for c in range(3):
+                emission = 1.0 if tables.triangle_textured[e] else tables.triangle_emission[e, c]
+                radiance[row, c] = weight * lights.radiance[light, c] * emission
+
+
+@parallel_kernel
+def sum_rays(values, begin, out):
+    """out[p] += sum of the rows begin[p]:begin[p + 1] of `values` (m, 3)."""
+    for i in prange(out.shape[0]):
+        r = 0.0
+        g = 0.0
+        b = 0.0
+        for k in range(begin[i], begin[i + 1]):
+            r += values[k, 0]
+            g += values[k, 1]
+            b += values[k, 2]
+        out[i, 0] += np.float32(r)
+        out[i, 1] += np.float32(g)
+        out[i, 2] += np.float32(b)

@@ -1,0 +1,432 @@
+"""Points and directions on light sources, and how probable they are.
+
+Every sampler answers for one receiving point with a unit direction, the distance to the
+light, the light's radiance towards the point and the probability per solid angle. Shapes are
+treated in their own space and carried to the world by the linear map M of `to_world`; a
+probability per solid angle p' there is ``p' |M d|^3 / |det M|`` in the world (d a unit
+direction, local), an area element of a surface with tangents a, b is scaled by |Ma x Mb|.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icheat_usd.kernels._jit import kernel
+from icheat_usd.kernels.environment import (
+    dome_lookup,
+    image_bilinear,
+    sample_dome_image,
+    search_cdf,
+)
+
+_SPHERE, _DISK, _RECT, _CYLINDER, _DISTANT, _DOME, _MESH = 0, 1, 2, 3, 4, 5, 6
+_FAR = np.inf
+
+
+class LightTables(NamedTuple):
+    """What sampling needs beside `scene.Lights`: inverses and cumulative distributions."""
+
+    to_local: NDArray[np.float64]  #: (n, 3, 3) inverse of the linear part of `to_world`; zeros where singular
+    determinant: NDArray[np.float64]  #: (n,) |det| of the linear part
+    columns_begin: NDArray[np.int64]  #: (n,) textured DOME: start in `columns_cdf`, else -1
+    columns_cdf: NDArray[np.float32]  #: per dome (height, width): cumulative over each row
+    rows_begin: NDArray[np.int64]  #: (n,) textured DOME: start in `rows_cdf`, else -1
+    rows_cdf: NDArray[np.float64]  #: per dome (height,)
+    triangle_cdf: NDArray[np.float64]  #: (n_emissive,) cumulative over each MESH light's triangles
+    triangle_corners: NDArray[np.float64]  #: (n_emissive, 3, 3) world space
+    triangle_emission: NDArray[np.float32]  #: (n_emissive, 3) mean emission of the material, over both sides
+    triangle_textured: NDArray[np.uint8]  #: (n_emissive,) 1: emission varies and is looked up per sample
+
+
+@kernel
+def _dot(ax, ay, az, bx, by, bz):
+    return ax * bx + ay * by + az * bz
+
+
+@kernel
+def _cross(ax, ay, az, bx, by, bz):
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@kernel
+def _normalized(x, y, z):
+    length = math.sqrt(x * x + y * y + z * z)
+    if length == 0.0:
+        return 0.0, 0.0, 0.0
+    return x / length, y / length, z / length
+
+
+@kernel
+def _linear(m, x, y, z):
+    """M (x, y, z) for the 3 x 3 part of `m`."""
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+    )
+
+
+@kernel
+def orthonormal_basis(nx, ny, nz):
+    """Two unit vectors that complete a unit normal (Duff et al. 2017, JCGT 6(1))."""
+    sign = math.copysign(1.0, nz)
+    a = -1.0 / (sign + nz)
+    b = nx * ny * a
+    return 1.0 + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny
+
+
+@kernel
+def _unit_disk(u1, u2):
+    """Concentric map of the unit square to the unit disk (Shirley & Chiu 1997)."""
+    a = 2.0 * u1 - 1.0
+    b = 2.0 * u2 - 1.0
+    if a == 0.0 and b == 0.0:
+        return 0.0, 0.0
+    if abs(a) > abs(b):
+        r = a
+        phi = (math.pi / 4.0) * (b / a)
+    else:
+        r = b
+        phi = math.pi / 2.0 - (math.pi / 4.0) * (a / b)
+    return r * math.cos(phi), r * math.sin(phi)
+
+
+@kernel
+def _to_solid_angle(pdf_world_area, distance, cosine):
+    return pdf_world_area * distance * distance / cosine
+
+
+@kernel
+def _plane_axes(m):
+    """World tangents of a disk or rect, its unit normal on the emitting (-Z) side, and |Mx x My|."""
+    ax, ay, az = m[0, 0] * 1.0, m[1, 0] * 1.0, m[2, 0] * 1.0
+    bx, by, bz = m[0, 1] * 1.0, m[1, 1] * 1.0, m[2, 1] * 1.0
+    cx, cy, cz = _cross(ax, ay, az, bx, by, bz)
+    area = math.sqrt(_dot(cx, cy, cz, cx, cy, cz))
+    if area == 0.0:
+        return ax, ay, az, bx, by, bz, 0.0, 0.0, 0.0, 0.0
+    # Mz decides the side, so that a mirrored light still shines where its own -Z went
+    side = 1.0 if _dot(cx, cy, cz, m[0, 2], m[1, 2], m[2, 2]) < 0.0 else -1.0
+    return ax, ay, az, bx, by, bz, side * cx / area, side * cy / area, side * cz / area, area
+
+
+@kernel
+def _spherical_rectangle(ex, ey, x0, y0, z0):
+    """Constants of Urena et al. 2013 for a rectangle [x0, x0 + ex] x [y0, y0 + ey] at depth z0 < 0."""
+    x1 = x0 + ex
+    y1 = y0 + ey
+    # z of the unit normals of the planes through the eye and each edge
+    l0 = math.sqrt(z0 * z0 + y0 * y0)
+    l1 = math.sqrt(z0 * z0 + x1 * x1)
+    l2 = math.sqrt(z0 * z0 + y1 * y1)
+    l3 = math.sqrt(z0 * z0 + x0 * x0)
+    n0z, n1z, n2z, n3z = -y0 / l0, x1 / l1, y1 / l2, -x0 / l3
+    g0 = math.acos(min(max(-n0z * n1z, -1.0), 1.0))
+    g1 = math.acos(min(max(-n1z * n2z, -1.0), 1.0))
+    g2 = math.acos(min(max(-n2z * n3z, -1.0), 1.0))
+    g3 = math.acos(min(max(-n3z * n0z, -1.0), 1.0))
+    k = 2.0 * math.pi - g2 - g3
+    return n0z, n2z, k, g0 + g1 - k
+
+
+# Below this solid angle the sum of four angles loses its digits; the rectangle is then so far
+# away that sampling its area is as good.
+_SMALLEST_SPHERICAL_RECTANGLE = 1e-7
+
+
+@kernel
+def _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, z0, x1, y1, u1, u2):
+    au = u1 * solid_angle + k
+    fu = (math.cos(au) * b0 - b1) / math.sin(au)
+    cu = math.copysign(1.0, fu) / math.sqrt(fu * fu + b0 * b0)
+    cu = min(max(cu, -1.0 + 1e-15), 1.0 - 1e-15)
+    xu = min(max(-(cu * z0) / math.sqrt(1.0 - cu * cu), x0), x1)
+    d2 = xu * xu + z0 * z0
+    d = math.sqrt(d2)
+    h0 = y0 / math.sqrt(d2 + y0 * y0)
+    h1 = y1 / math.sqrt(d2 + y1 * y1)
+    hv = h0 + u2 * (h1 - h0)
+    yv = hv * d / math.sqrt(1.0 - hv * hv) if hv * hv < 1.0 - 1e-12 else y1
+    return xu, min(max(yv, y0), y1)
+
+
+@kernel
+def _rect_radiance(lights, textures, light, x, y):
+    """Image of a textured rect at (x, y) in [0, 1]^2 of its plane: upright for who looks at its lit side."""
+    texture = lights.texture[light]
+    if texture < 0:
+        return 1.0, 1.0, 1.0
+    return image_bilinear(
+        textures.texels,
+        textures.begin[texture],
+        textures.width[texture],
+        textures.height[texture],
+        1.0 - x,
+        1.0 - y,
+        False,
+    )
+
+
+@kernel
+def _sample_rect(lights, textures, light, px, py, pz, u1, u2):
+    m = lights.to_world[light]
+    ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
+    width = float(lights.size[light, 0])
+    height = float(lights.size[light, 1])
+    area = scale * width * height
+    if area == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    # receiver relative to the centre; depth along the emitting side's normal
+    qx, qy, qz = m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz
+    depth = -_dot(qx, qy, qz, nx, ny, nz)
+    if depth <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    la = math.sqrt(_dot(ax, ay, az, ax, ay, az))
+    lb = math.sqrt(_dot(bx, by, bz, bx, by, bz))
+    x = u1
+    y = u2
+    pdf = 0.0
+    if abs(_dot(ax, ay, az, bx, by, bz)) < 1e-6 * la * lb and depth > 1e-6 * (la * width + lb * height):
+        ex = la * width
+        ey = lb * height
+        x0 = _dot(qx, qy, qz, ax, ay, az) / la - 0.5 * ex
+        y0 = _dot(qx, qy, qz, bx, by, bz) / lb - 0.5 * ey
+        b0, b1, k, solid_angle = _spherical_rectangle(ex, ey, x0, y0, -depth)
+        if solid_angle > _SMALLEST_SPHERICAL_RECTANGLE:
+            xu, yv = _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, -depth, x0 + ex, y0 + ey, u1, u2)
+            x = (xu - x0) / ex
+            y = (yv - y0) / ey
+            pdf = 1.0 / solid_angle
+    sx = (x - 0.5) * width
+    sy = (y - 0.5) * height
+    dx, dy, dz = qx + ax * sx + bx * sy, qy + ay * sx + by * sy, qz + az * sx + bz * sy
+    distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
+    if pdf == 0.0:
+        pdf = _to_solid_angle(1.0 / area, distance, depth / distance)
+    r, g, b = _rect_radiance(lights, textures, light, x, y)
+    return dx / distance, dy / distance, dz / distance, distance, pdf, r, g, b
+
+
+@kernel
+def _sample_disk(lights, light, px, py, pz, u1, u2):
+    m = lights.to_world[light]
+    ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
+    radius = float(lights.size[light, 0])
+    area = scale * math.pi * radius * radius
+    qx, qy, qz = m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz
+    depth = -_dot(qx, qy, qz, nx, ny, nz)
+    if area == 0.0 or depth <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    x, y = _unit_disk(u1, u2)
+    x *= radius
+    y *= radius
+    dx, dy, dz = qx + ax * x + bx * y, qy + ay * x + by * y, qz + az * x + bz * y
+    distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
+    pdf = _to_solid_angle(1.0 / area, distance, depth / distance)
+    return dx / distance, dy / distance, dz / distance, distance, pdf, 1.0, 1.0, 1.0
+
+
+@kernel
+def _direction_scale(m, determinant, x, y, z):
+    """World solid angle pdf over local one, for the unit local direction (x, y, z)."""
+    wx, wy, wz = _linear(m, x, y, z)
+    length = math.sqrt(_dot(wx, wy, wz, wx, wy, wz))
+    return length * length * length / determinant
+
+
+@kernel
+def _sample_sphere(lights, tables, light, px, py, pz, u1, u2):
+    """Cone that the sphere fills, in the space where it is the unit sphere; emits outwards only."""
+    m = lights.to_world[light]
+    radius = float(lights.size[light, 0])
+    determinant = tables.determinant[light]
+    if radius <= 0.0 or determinant == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    qx, qy, qz = _linear(tables.to_local[light], m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz)
+    qx, qy, qz = qx / radius, qy / radius, qz / radius
+    d2 = _dot(qx, qy, qz, qx, qy, qz)
+    if d2 <= 1.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    d = math.sqrt(d2)
+    zx, zy, zz = qx / d, qy / d, qz / d
+    one_minus_cos = (1.0 / d2) / (1.0 + math.sqrt(1.0 - 1.0 / d2))
+    c = u1 * one_minus_cos
+    cos_theta = 1.0 - c
+    sin2 = c * (2.0 - c)
+    sin_theta = math.sqrt(sin2)
+    phi = 2.0 * math.pi * u2
+    sx, sy, sz, tx, ty, tz = orthonormal_basis(zx, zy, zz)
+    a = sin_theta * math.cos(phi)
+    b = sin_theta * math.sin(phi)
+    dx = a * sx + b * tx + cos_theta * zx
+    dy = a * sy + b * ty + cos_theta * zy
+    dz = a * sz + b * tz + cos_theta * zz
+    t = d * cos_theta - math.sqrt(max(0.0, 1.0 - d2 * sin2))
+    pdf = _direction_scale(m, determinant, dx, dy, dz) / (2.0 * math.pi * one_minus_cos)
+    wx, wy, wz = _linear(m, dx * radius * t, dy * radius * t, dz * radius * t)
+    distance = math.sqrt(_dot(wx, wy, wz, wx, wy, wz))
+    if distance == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    return wx / distance, wy / distance, wz / distance, distance, pdf, 1.0, 1.0, 1.0
+
+
+@kernel
+def _sample_cylinder(lights, tables, light, px, py, pz, u1, u2):
+    """Lateral surface about X, the part of it that faces the point; no caps, emits outwards only."""
+    m = lights.to_world[light]
+    radius = float(lights.size[light, 0])
+    length = float(lights.size[light, 1])
+    if radius <= 0.0 or length <= 0.0 or tables.determinant[light] == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    ox, oy, oz = px - m[0, 3], py - m[1, 3], pz - m[2, 3]
+    lx, ly, lz = _linear(tables.to_local[light], ox, oy, oz)
+    rho = math.sqrt(ly * ly + lz * lz)
+    if rho <= radius:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    half = math.acos(radius / rho)  # beyond it the tangent plane hides the point, in any affine picture
+    phi = math.atan2(lz, ly) + half * (2.0 * u2 - 1.0)
+    c = math.cos(phi)
+    s = math.sin(phi)
+    wx, wy, wz = _linear(m, (u1 - 0.5) * length, radius * c, radius * s)
+    ax, ay, az = m[0, 0] * 1.0, m[1, 0] * 1.0, m[2, 0] * 1.0
+    bx, by, bz = _linear(m, 0.0, -radius * s, radius * c)
+    nx, ny, nz = _cross(ax, ay, az, bx, by, bz)
+    jacobian = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
+    dx, dy, dz = wx - ox, wy - oy, wz - oz
+    distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
+    if jacobian == 0.0 or distance == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    cosine = abs(_dot(nx, ny, nz, dx, dy, dz)) / (jacobian * distance)
+    if cosine < 1e-9:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    pdf = _to_solid_angle(1.0 / (2.0 * half * length * jacobian), distance, cosine)
+    return dx / distance, dy / distance, dz / distance, distance, pdf, 1.0, 1.0, 1.0
+
+
+@kernel
+def _sample_distant(lights, light, u1, u2):
+    """Cone about local +Z; a half-angle of zero is one direction whose `radiance` is an irradiance (pdf 1)."""
+    m = lights.to_world[light]
+    zx, zy, zz = _normalized(m[0, 2] * 1.0, m[1, 2] * 1.0, m[2, 2] * 1.0)
+    angle = float(lights.size[light, 0])
+    if angle <= 0.0:
+        return zx, zy, zz, _FAR, 1.0, 1.0, 1.0, 1.0
+    half_sine = math.sin(0.5 * angle)
+    one_minus_cos = 2.0 * half_sine * half_sine
+    c = u1 * one_minus_cos
+    r = math.sqrt(max(0.0, c * (2.0 - c)))
+    phi = 2.0 * math.pi * u2
+    sx, sy, sz, tx, ty, tz = orthonormal_basis(zx, zy, zz)
+    a = r * math.cos(phi)
+    b = r * math.sin(phi)
+    w = 1.0 - c
+    return (
+        a * sx + b * tx + w * zx,
+        a * sy + b * ty + w * zy,
+        a * sz + b * tz + w * zz,
+        _FAR,
+        1.0 / (2.0 * math.pi * one_minus_cos),
+        1.0,
+        1.0,
+        1.0,
+    )
+
+
+@kernel
+def _sample_dome(lights, textures, tables, light, nx, ny, nz, u1, u2):
+    """Textured: in proportion to the image. Untextured: cosine about the normal (nx, ny, nz)."""
+    texture = lights.texture[light]
+    if texture < 0:
+        x, y = _unit_disk(u1, u2)
+        z = math.sqrt(max(0.0, 1.0 - x * x - y * y))
+        sx, sy, sz, tx, ty, tz = orthonormal_basis(nx, ny, nz)
+        return (
+            x * sx + y * tx + z * nx,
+            x * sy + y * ty + z * ny,
+            x * sz + y * tz + z * nz,
+            _FAR,
+            z / math.pi,
+            1.0,
+            1.0,
+            1.0,
+        )
+    if tables.determinant[light] == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    x, y, z, pdf = sample_dome_image(
+        tables.rows_cdf,
+        tables.rows_begin[light],
+        tables.columns_cdf,
+        tables.columns_begin[light],
+        textures.width[texture],
+        textures.height[texture],
+        u1,
+        u2,
+    )
+    if pdf <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    r, g, b = dome_lookup(textures, texture, x, y, z)
+    m = lights.to_world[light]
+    pdf *= _direction_scale(m, tables.determinant[light], x, y, z)
+    wx, wy, wz = _linear(m, x, y, z)
+    wx, wy, wz = _normalized(wx, wy, wz)
+    return wx, wy, wz, _FAR, pdf, r, g, b
+
+
+@kernel
+def sample_analytic(lights, textures, tables, light, px, py, pz, nx, ny, nz, u1, u2):
+    """Direction to the light (3), distance, pdf per solid angle, radiance (3), for every kind but MESH.
+
+    Radiance is relative to `lights.radiance`. pdf 0 means that the light does not reach the point.
+    """
+    kind = lights.kind[light]
+    if kind == _SPHERE:
+        return _sample_sphere(lights, tables, light, px, py, pz, u1, u2)
+    if kind == _DISK:
+        return _sample_disk(lights, light, px, py, pz, u1, u2)
+    if kind == _RECT:
+        return _sample_rect(lights, textures, light, px, py, pz, u1, u2)
+    if kind == _CYLINDER:
+        return _sample_cylinder(lights, tables, light, px, py, pz, u1, u2)
+    if kind == _DISTANT:
+        return _sample_distant(lights, light, u1, u2)
+    return _sample_dome(lights, textures, tables, light, nx, ny, nz, u1, u2)
+
+
+@kernel
+def sample_mesh(lights, tables, light, px, py, pz, u1, u2):
+    """Row of the emissive tables, barycentric (2), point (3), unit geometric normal (3), pdf per solid angle."""
+    begin = lights.triangle_begin[light]
+    row = search_cdf(tables.triangle_cdf, begin, lights.triangle_begin[light + 1], u1)
+    below = tables.triangle_cdf[row - 1] if row > begin else 0.0
+    probability = tables.triangle_cdf[row] - below
+    if probability <= 0.0:
+        return row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0
+    v1 = min(max((u1 - below) / probability, 0.0), 1.0)
+    # low-distortion map of the square to the triangle (Heitz 2019) keeps strata compact
+    if u2 > v1:
+        b1 = 0.5 * v1
+        b2 = u2 - b1
+    else:
+        b2 = 0.5 * u2
+        b1 = v1 - b2
+    p = tables.triangle_corners[row]
+    ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
+    bx, by, bz = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
+    nx, ny, nz = _cross(ax, ay, az, bx, by, bz)
+    double_area = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
+    lx = p[0, 0] + b1 * ax + b2 * bx
+    ly = p[0, 1] + b1 * ay + b2 * by
+    lz = p[0, 2] + b1 * az + b2 * bz
+    if double_area == 0.0:
+        return row, b1, b2, lx, ly, lz, 0.0, 0.0, 1.0, 0.0
+    nx, ny, nz = nx / double_area, ny / double_area, nz / double_area
+    dx, dy, dz = lx - px, ly - py, lz - pz
+    distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
+    cosine = abs(_dot(dx, dy, dz, nx, ny, nz)) / distance if distance > 0.0 else 0.0
+    if cosine < 1e-9:
+        return row, b1, b2, lx, ly, lz, nx, ny, nz, 0.0
+    return row, b1, b2, lx, ly, lz, nx, ny, nz, _to_solid_angle(2.0 * probability / double_area, distance, cosine)

@@ -1,0 +1,208 @@
+"""What is precomputed to sample the lights of a snapshot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icheat_usd.kernels.environment import dome_columns_cdf
+from icheat_usd.kernels.lights import LightTables
+from icheat_usd.materials import points_on_surface
+from icheat_usd.scene import F32, F64, LightKind, Lights, SceneSnapshot, Texture
+
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec.709
+
+# Where the emission of a textured triangle is averaged for its share of the samples.
+_PLACES = np.array([(1, 1), (4, 1), (1, 4), (2.5, 2.5), (1, 2.5), (2.5, 1), (2, 2), (0.3, 0.3), (5.4, 0.3), (0.3, 5.4)])
+_PLACES = (_PLACES / 6.0).astype(np.float32)
+
+# Share of a textured triangle's weight that does not depend on those places: they may all be black.
+_BLIND_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class LightSampler:
+    """Distributions over the texels of domes and the triangles of mesh lights of one snapshot."""
+
+    tables: LightTables
+
+    @property
+    def n_lights(self) -> int:
+        return len(self.tables.determinant)
+
+
+def build_light_sampler(snapshot: SceneSnapshot) -> LightSampler:
+    """Prepare the sampling of every light.
+
+    Dome texels get a probability proportional to the luminance of the bilinear image averaged
+    over the texel times its solid angle; triangles of a mesh light one proportional to world
+    area times mean luminance of the emission.
+    """
+    lights = snapshot.lights
+    n = len(lights.kind)
+    linear = lights.to_world[:, :, :3].astype(np.float64)
+    determinant = np.abs(np.linalg.det(linear)) if n else np.zeros(0)
+    to_local = np.zeros((n, 3, 3))
+    for light in np.flatnonzero(determinant > 0.0):
+        to_local[light] = np.linalg.inv(linear[light])
+    columns_begin, columns_cdf, rows_begin, rows_cdf = _dome_distributions(snapshot)
+    cdf, corners, emission, textured = _triangle_distributions(snapshot)
+    return LightSampler(
+        LightTables(
+            to_local=to_local,
+            determinant=determinant,
+            columns_begin=columns_begin,
+            columns_cdf=columns_cdf,
+            rows_begin=rows_begin,
+            rows_cdf=rows_cdf,
+            triangle_cdf=cdf,
+            triangle_corners=corners,
+            triangle_emission=emission,
+            triangle_textured=textured,
+        )
+    )
+
+
+def _dome_distributions(snapshot: SceneSnapshot) -> tuple[np.ndarray, F32, np.ndarray, F64]:
+    lights, textures = snapshot.lights, snapshot.textures
+    columns_begin = np.full(len(lights.kind), -1, np.int64)
+    rows_begin = np.full(len(lights.kind), -1, np.int64)
+    columns: list[F32] = []
+    rows: list[F64] = []
+    n_columns = n_rows = 0
+    for light in np.flatnonzero((lights.kind == LightKind.DOME) & (lights.texture >= 0)):
+        texture = int(lights.texture[light])
+        width, height = int(textures.width[texture]), int(textures.height[texture])
+        cdf = np.zeros(width * height, np.float32)
+        weight = np.zeros(height)
+        dome_columns_cdf(textures.texels, int(textures.begin[texture]), width, height, cdf, weight)
+        total = weight.sum()
+        cumulative = np.cumsum(weight) / total if total > 0.0 else weight
+        if total > 0.0:
+            cumulative[np.flatnonzero(weight)[-1] :] = 1.0  # rounding must not leave the last row short
+        columns_begin[light], rows_begin[light] = n_columns, n_rows
+        columns.append(cdf)
+        rows.append(cumulative)
+        n_columns += width * height
+        n_rows += height
+    return (
+        columns_begin,
+        np.concatenate(columns) if columns else np.zeros(1, np.float32),
+        rows_begin,
+        np.concatenate(rows) if rows else np.zeros(1),
+    )
+
+
+def _triangle_distributions(snapshot: SceneSnapshot) -> tuple[F64, F64, F32, np.ndarray]:
+    geometry, materials, lights = snapshot.geometry, snapshot.materials, snapshot.lights
+    n = len(lights.triangle)
+    if n == 0:
+        return np.zeros(1), np.zeros((1, 3, 3)), np.zeros((1, 3), np.float32), np.zeros(1, np.uint8)
+    to_world = geometry.instance_to_world[lights.triangle_instance].astype(np.float64)
+    corners = np.einsum("nij,nkj->nki", to_world[:, :, :3], geometry.points[lights.triangle]) + to_world[:, None, :, 3]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+
+    textured = materials.texture[geometry.material[lights.triangle], Texture.EMISSION] >= 0
+    emission = np.zeros((n, 3))
+    for group, places in ((~textured, _PLACES[:1]), (textured, _PLACES)):
+        rows = np.flatnonzero(group)
+        for place in places if len(rows) else ():
+            emission[rows] += _emission_at(snapshot, rows, place) / len(places)
+    luminance = np.maximum(emission @ _LUMINANCE, 0.0)
+
+    cdf = np.zeros(n)
+    for begin, end in zip(lights.triangle_begin[:-1], lights.triangle_begin[1:], strict=True):
+        if end == begin:
+            continue
+        part = slice(int(begin), int(end))
+        weight = area[part] * luminance[part]
+        if textured[part].any():
+            mean = weight.sum() / max(area[part].sum(), 1e-300)
+            blind = np.where(textured[part], area[part] * (mean if mean > 0.0 else 1.0), 0.0)
+            weight = weight + _BLIND_SHARE * blind
+        total = weight.sum()
+        if total > 0.0:
+            cdf[part] = np.cumsum(weight) / total
+            cdf[int(begin) + int(np.flatnonzero(weight)[-1]) : int(end)] = 1.0
+    return cdf, np.ascontiguousarray(corners), emission.astype(np.float32), textured.astype(np.uint8)
+
+
+def _emission_at(snapshot: SceneSnapshot, rows: np.ndarray, place: F32) -> F32:
+    lights = snapshot.lights
+    points = points_on_surface(
+        snapshot,
+        np.ascontiguousarray(lights.triangle_instance[rows]),
+        np.ascontiguousarray(lights.triangle[rows]),
+        np.tile(place, (len(rows), 1)),
+        np.zeros(len(rows), np.uint8),
+    )
+    return points.emission
+
+
+def total_power(snapshot: SceneSnapshot, sampler: LightSampler) -> F64:
+    """Flux of each light per colour channel, for choosing among lights.
+
+    Returns
+    -------
+    (n_lights, 3) float64, watts (radiance x area x pi)
+        Distant lights and domes: through the disk of the scene's radius; mesh lights count both sides;
+        textured mesh lights are as exact as the places at which their emission was averaged.
+    """
+    lights, tables = snapshot.lights, sampler.tables
+    power = np.zeros((len(lights.kind), 3))
+    disk = np.pi * float(snapshot.radius) ** 2
+    for light, kind in enumerate(lights.kind):
+        radiance = lights.radiance[light].astype(np.float64)
+        linear = lights.to_world[light, :, :3].astype(np.float64)
+        a, b = (float(value) for value in lights.size[light])
+        if kind == LightKind.MESH:
+            part = slice(int(lights.triangle_begin[light]), int(lights.triangle_begin[light + 1]))
+            corners = tables.triangle_corners[part]
+            area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+            power[light] = np.pi * radiance * (area @ tables.triangle_emission[part])  # area is doubled: two sides
+        elif kind == LightKind.DISTANT:
+            power[light] = radiance * disk * (np.pi * np.sin(min(a, np.pi / 2)) ** 2 if a > 0.0 else 1.0)
+        elif kind == LightKind.DOME:
+            power[light] = radiance * 4.0 * np.pi * disk * _mean_image(snapshot, light, True)
+        elif kind in (LightKind.DISK, LightKind.RECT):
+            plane = float(np.linalg.norm(np.cross(linear[:, 0], linear[:, 1])))
+            area = plane * (np.pi * a * a if kind == LightKind.DISK else a * b)
+            power[light] = np.pi * radiance * area * _mean_image(snapshot, light, False)
+        else:
+            power[light] = np.pi * radiance * _curved_area(int(kind), linear, a, b)
+    return power
+
+
+def _mean_image(snapshot: SceneSnapshot, light: int, latlong: bool) -> F64:
+    texture = int(snapshot.lights.texture[light])
+    if texture < 0:
+        return np.ones(3)
+    textures = snapshot.textures
+    begin, width, height = (int(column[texture]) for column in (textures.begin, textures.width, textures.height))
+    image = textures.texels[begin : begin + width * height, :3].reshape(height, width, 3)
+    rows = image.mean(axis=1, dtype=np.float64)
+    if not latlong:
+        return np.asarray(rows.mean(axis=0))
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    return np.asarray((edges[:-1] - edges[1:]) @ rows / 2.0)
+
+
+def _curved_area(kind: int, linear: F64, radius: float, length: float) -> float:
+    """World area of a transformed sphere or of a cylinder's side, by midpoint quadrature."""
+    phi = (np.arange(256) + 0.5) * (2.0 * np.pi / 256)
+    if kind == LightKind.CYLINDER:
+        around = np.stack([0 * phi, -np.sin(phi), np.cos(phi)], -1) @ linear.T
+        return float(np.linalg.norm(np.cross(linear[:, 0], around), axis=1).mean() * 2.0 * np.pi * radius * length)
+    z = (np.arange(128) + 0.5) / 64 - 1.0
+    r = np.sqrt(1.0 - z * z)[:, None]
+    normal = np.stack([r * np.cos(phi), r * np.sin(phi), np.broadcast_to(z[:, None], (128, 256))], -1)
+    # an area element with normal n grows by |cofactor(M) n|
+    x, y, z = linear
+    cofactor = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)])
+    return float(np.linalg.norm(normal @ cofactor.T, axis=-1).mean() * 4.0 * np.pi * radius**2)
+
+
+def lights_of_kind(lights: Lights, *kinds: LightKind) -> list[int]:
+    """Rows of `lights` of any of `kinds`, ascending."""
+    return [int(light) for light in np.flatnonzero(np.isin(lights.kind, [int(kind) for kind in kinds]))]
