@@ -1,0 +1,94 @@
+"""Films to PNG, as a screen shows them."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icheat_usd.image.colour import default_display, to_display
+from icheat_usd.image.exr import METADATA_PREFIX, replacing
+from icheat_usd.image.film import Film
+
+
+def write_png(
+    film: Film,
+    path: str | os.PathLike[str],
+    *,
+    layer: str = "beauty",
+    view: str | None = None,
+    display: str | None = None,
+    exposure: float = 0.0,
+    dither: bool = False,
+) -> Path:
+    """Write one layer as an 8-bit RGB PNG through a display view.
+
+    Parameters
+    ----------
+    film : Film
+    path : path
+        An existing file is replaced only once the new one is complete.
+    layer : str
+    view, display : str or None
+        Names in the active OpenColorIO configuration; None takes its defaults.
+    exposure : float, stops
+    dither : bool
+        See `icheat_usd.image.colour.to_display`.
+
+    Returns
+    -------
+    Path
+        The file written. It carries the film's metadata as text, and an sRGB chunk where the display is sRGB.
+
+    Raises
+    ------
+    ImageError
+        There is no such layer, display or view, or the file cannot be written.
+    """
+    target = Path(path)
+    pixels = to_display(film.layer(layer), display=display, view=view, exposure=exposure, dither=dither)
+    srgb = (display or default_display()).startswith("sRGB")
+    encoded = encode_png(pixels, srgb=srgb, text={METADATA_PREFIX + key: text for key, text in film.metadata.items()})
+    with replacing(target) as temporary:
+        temporary.write_bytes(encoded)
+    return target
+
+
+def encode_png(pixels: NDArray[np.uint8], *, srgb: bool, text: dict[str, str]) -> bytes:
+    """An 8-bit RGB image as the bytes of a PNG file.
+
+    Parameters
+    ----------
+    pixels : (height, width, 3) uint8, display-encoded
+    srgb : bool
+        State with an sRGB chunk that the values are sRGB.
+    text : dict of str to str
+        International text; a keyword is cut to the 79 Latin-1 bytes that PNG allows.
+
+    References
+    ----------
+    .. [1] Portable Network Graphics (PNG) Specification, third edition, W3C 2025: chunks 11, filter "Up" 9.2.
+    """
+    # Written here because image libraries differ in which of these chunks they write, and from release to release.
+    height, width, _ = pixels.shape
+    rows = pixels.reshape(height, width * 3)
+    filtered = np.full((height, 1 + width * 3), 2, dtype=np.uint8)  # column 0: the filter type of the row, "Up"
+    filtered[0, 1:] = rows[0]
+    filtered[1:, 1:] = rows[1:] - rows[:-1]
+    chunks = [_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))]
+    if srgb:
+        chunks.append(_chunk(b"sRGB", b"\0"))  # rendering intent: perceptual
+    for key, value in sorted(text.items()):
+        keyword = key.encode("latin-1", "replace")[:79]
+        chunks.append(_chunk(b"iTXt", keyword + b"\0\0\0\0\0" + value.encode("utf-8", "replace")))
+    chunks.append(_chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)))
+    chunks.append(_chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
