@@ -1,0 +1,440 @@
+"""Lights of a stage as rows of `Lights`.
+
+A light's radiance is ``color * intensity * 2^exposure``, times the colour of a black body where
+`enableColorTemperature` is on, over a size factor where `normalize` is on [1]_. In units: intensity 1
+is 1 nit, a radiance of 1 here.
+
+Size factors are areas in **stage units**, world space, the transform's scale included: what is
+authored as 2 x 3 counts as 6 whether a unit is a metre or a centimetre. So calling the same stage
+centimetres instead of metres leaves its picture as it was, as for lights that are not normalized.
+
+.. [1] https://openusd.org/release/user_guides/schemas/usdLux/LightAPI.html
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+
+from icheat_usd.scene import F64, Finding, Geometry, LightKind, Lights, Materials, Surface, Texture, Textures
+from icheat_usd.stage.shading import Report, resolve_input, time_code
+from icheat_usd.stage.textures import TextureLibrary
+from icheat_usd.stage.transforms import Placement, from_gf
+
+#: Radius, in metres, of the sphere that stands in for a point light whose radius is zero.
+POINT_RADIUS = 1e-3
+
+
+@dataclass(frozen=True)
+class _Light:
+    """One row of `Lights` before it becomes one."""
+
+    path: str
+    kind: LightKind
+    to_world: F64
+    radiance: F64
+    size: tuple[float, float] = (0.0, 0.0)
+    texture: int = -1
+    surface: int = -1
+
+
+def read_lights(
+    prims: Iterable[Usd.Prim],
+    time: Usd.TimeCode | float | None,
+    placement: Placement,
+    textures: TextureLibrary,
+) -> tuple[Lights, tuple[str, ...], list[Finding]]:
+    """Lights that are prims of their own; `with_mesh_lights` adds emissive meshes.
+
+    Parameters
+    ----------
+    prims
+        Prims that may be lights, instance proxies included; others are passed over.
+    time
+        When transforms and inputs are read; None is the earliest time.
+    placement
+        Takes local-to-world matrices to metres about the scene's centre.
+    textures
+        Receives the images of textured lights.
+
+    Returns
+    -------
+    Lights
+        In the order of `prims`. A distant light of angle 0 has half-angle 0 and, as `radiance`, the
+        irradiance on a plane that faces it: its size factor is 1 [1]_.
+    tuple of str
+        Scene path of each.
+    list of Finding
+        What is not supported, once per light and feature. Files that cannot be read are among the
+        findings of `textures`.
+
+    Notes
+    -----
+    Invisible lights are left out. Colour temperature is `UsdLux.BlackbodyTemperatureAsRgb`, of
+    luminance 1 and within 4 % of white at 6500 K. A light whose image cannot be used keeps its
+    plain colour.
+
+    References
+    ----------
+    .. [1] https://openusd.org/release/user_guides/schemas/usdLux/LightAPI.html, "normalize"
+    """
+    reader = _Reader(time_code(time), placement, textures)
+    rows = [row for prim in prims for row in reader.read(prim)]
+    return _table(rows), tuple(row.path for row in rows), reader.report.findings
+
+
+def with_mesh_lights(
+    lights: Lights,
+    paths: tuple[str, ...],
+    geometry: Geometry,
+    surfaces: Sequence[Surface],
+    materials: Materials,
+    textures: Textures,
+) -> tuple[Lights, tuple[str, ...]]:
+    """Append one light per placed mesh that has triangles of an emissive material.
+
+    Parameters
+    ----------
+    lights, paths
+        Rows so far; their own mesh rows, if any, are kept.
+    geometry, surfaces, materials, textures
+        Of the snapshot. A material emits where its emissive colour is above zero in any channel, or
+        where the image of its emissive colour has a texel that is after scale and bias.
+
+    Returns
+    -------
+    Lights, tuple of str
+        The new rows' paths are their surfaces'; instances of a point instancer share one.
+    """
+    emissive = np.array((materials.emission > 0.0).any(axis=1))
+    for row in np.flatnonzero(materials.texture[:, Texture.EMISSION] >= 0):
+        emissive[row] = _texture_emits(materials, textures, int(row))
+    shines = emissive[geometry.material] if len(geometry.material) else np.zeros(0, np.bool_)
+    per_mesh = [
+        first + np.flatnonzero(shines[first:last])
+        for first, last in zip(geometry.mesh_begin[:-1], geometry.mesh_begin[1:], strict=True)
+    ]
+    instances = [i for i, mesh in enumerate(geometry.instance_mesh) if len(per_mesh[mesh])]
+    rows = [
+        _Light(
+            path=surfaces[geometry.instance_surface[i]].path,
+            kind=LightKind.MESH,
+            to_world=geometry.instance_to_world[i].astype(np.float64),
+            radiance=np.ones(3),
+            surface=int(geometry.instance_surface[i]),
+        )
+        for i in instances
+    ]
+    triangles = [per_mesh[geometry.instance_mesh[i]] for i in instances]
+    counts = np.array([len(t) for t in triangles], np.int64)
+    added = _table(rows)._replace(
+        triangle_begin=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        triangle=np.concatenate([np.zeros(0, np.int32), *triangles]).astype(np.int32),
+        triangle_instance=np.repeat(np.array(instances, np.int32), counts),
+    )
+    begin = np.concatenate([lights.triangle_begin, lights.triangle_begin[-1] + added.triangle_begin[1:]])
+    joined = {name: np.concatenate([getattr(lights, name), getattr(added, name)]) for name in Lights._fields}
+    return Lights(**(joined | {"triangle_begin": begin})), paths + tuple(row.path for row in rows)
+
+
+def _texture_emits(materials: Materials, textures: Textures, row: int) -> bool:
+    image = materials.texture[row, Texture.EMISSION]
+    first = textures.begin[image]
+    count = int(textures.width[image]) * int(textures.height[image])
+    texels = textures.texels[first : first + count]
+    brightest = np.stack([texels.min(axis=0), texels.max(axis=0)])  # a negative scale makes the darkest brightest
+    values = brightest * materials.texture_scale[row, Texture.EMISSION] + materials.texture_bias[row, Texture.EMISSION]
+    channel = materials.texture_channel[row, Texture.EMISSION]
+    return bool((values[:, :3] > 0.0).any() if channel < 0 else (values[:, channel] > 0.0).any())
+
+
+def _table(rows: Sequence[_Light]) -> Lights:
+    n = len(rows)
+    return Lights(
+        kind=np.array([row.kind for row in rows], np.int32),
+        to_world=np.array([row.to_world for row in rows], np.float32).reshape(n, 3, 4),
+        radiance=np.array([row.radiance for row in rows], np.float32).reshape(n, 3),
+        size=np.array([row.size for row in rows], np.float32).reshape(n, 2),
+        texture=np.array([row.texture for row in rows], np.int32),
+        surface=np.array([row.surface for row in rows], np.int32),
+        triangle_begin=np.zeros(n + 1, np.int64),
+        triangle=np.zeros(0, np.int32),
+        triangle_instance=np.zeros(0, np.int32),
+    )
+
+
+# Size factors -----------------------------------------------------------------------------------
+
+
+def rect_area(linear: F64, width: float, height: float) -> float:
+    """World area of a rectangle in XY under a linear map ``(3, 3)``."""
+    return float(np.linalg.norm(np.cross(linear[:, 0], linear[:, 1]))) * width * height
+
+
+def disk_area(linear: F64, radius: float) -> float:
+    """World area of a disk in XY under a linear map ``(3, 3)``."""
+    return rect_area(linear, math.pi * radius, radius)
+
+
+def sphere_area(linear: F64, radius: float) -> float:
+    """World area of a sphere under a linear map ``(3, 3)``: of an ellipsoid, where it scales unevenly.
+
+    The area element of a unit sphere grows by |cofactor(linear) n|, and n |-> |C n| has the same mean
+    for C as for its singular values, integrated here over one octant.
+    """
+    s = np.linalg.svd(linear, compute_uv=False)
+    cofactors = np.array([s[1] * s[2], s[2] * s[0], s[0] * s[1]])
+    node, weight = np.polynomial.legendre.leggauss(48)
+    z = (node[:, None] + 1.0) / 2.0
+    angle = (node[None, :] + 1.0) * (math.pi / 4.0)
+    across = np.sqrt(1.0 - z * z)
+    # The smallest cofactor along the pole keeps the integrand smooth where the others vary most.
+    growth = np.sqrt(
+        (across * np.cos(angle) * cofactors[2]) ** 2
+        + (across * np.sin(angle) * cofactors[1]) ** 2
+        + (z * cofactors[0]) ** 2
+    )
+    octant = float(weight @ growth @ weight) * (math.pi / 8.0)
+    return 8.0 * octant * radius * radius
+
+
+def cylinder_area(linear: F64, radius: float, length: float) -> float:
+    """World area of the side of a cylinder along X under a linear map ``(3, 3)``, caps left out."""
+    angle = np.arange(512) * (2.0 * math.pi / 512)
+    tangents = np.outer(linear[:, 2], np.cos(angle)) - np.outer(linear[:, 1], np.sin(angle))
+    growth = np.linalg.norm(np.cross(linear[:, 0], tangents.T), axis=1)
+    return float(growth.mean()) * 2.0 * math.pi * radius * length
+
+
+def distant_size_factor(half_angle: float) -> float:
+    """What a distant light's radiance is divided by: the irradiance that radiance 1 makes on a plane facing it."""
+    theta = min(max(half_angle, 0.0), math.pi)
+    if theta == 0.0:
+        return 1.0
+    sine = math.sin(theta) ** 2
+    return math.pi * (sine if theta <= math.pi / 2.0 else 2.0 - sine)
+
+
+# Reading ----------------------------------------------------------------------------------------
+
+
+class _Reader:
+    def __init__(self, time: Usd.TimeCode, placement: Placement, textures: TextureLibrary) -> None:
+        self.time = time
+        self.placement = placement
+        self.textures = textures
+        self.report = Report()
+        self.transforms = UsdGeom.XformCache(time)
+        self.kinds: dict[str, Callable[[Usd.Prim, F64], _Light | None]] = {
+            "SphereLight": self._sphere,
+            "DiskLight": self._disk,
+            "RectLight": self._rect,
+            "CylinderLight": self._cylinder,
+            "DistantLight": self._distant,
+            "DomeLight": self._dome,
+            "DomeLight_1": self._dome,
+        }
+
+    def read(self, prim: Usd.Prim) -> list[_Light]:
+        kind = str(prim.GetTypeName())
+        if not self._is_light(prim) or self._is_invisible(prim):
+            return []
+        if kind not in self.kinds:
+            self._report_kind(prim, kind)
+            return []
+        self._report_unsupported(prim, kind)
+        # Stage units; the placement turns it to metres once the sizes that need stage units are known.
+        light = self.kinds[kind](prim, from_gf(self.transforms.GetLocalToWorldTransform(prim))[:, :3])
+        return [] if light is None else [light]
+
+    def _is_light(self, prim: Usd.Prim) -> bool:
+        return bool(prim) and (
+            prim.HasAPI(UsdLux.LightAPI) or prim.IsA(UsdLux.PortalLight) or prim.IsA(UsdLux.PluginLight)
+        )
+
+    def _is_invisible(self, prim: Usd.Prim) -> bool:
+        imageable = UsdGeom.Imageable(prim)
+        return bool(imageable) and imageable.ComputeVisibility(self.time) == UsdGeom.Tokens.invisible
+
+    # Kinds --------------------------------------------------------------------------------------
+
+    def _sphere(self, prim: Usd.Prim, linear: F64) -> _Light | None:
+        radius = self._number(prim, "radius", 0.5)
+        as_point = bool(prim.GetAttribute("treatAsPoint").Get(self.time))
+        if radius <= 0.0 and as_point:
+            scale = float(np.linalg.norm(linear, 2)) * self.placement.meters_per_unit
+            radius = POINT_RADIUS / scale if scale > 0.0 else POINT_RADIUS
+        elif as_point:
+            self._unsupported(prim, "treatAsPoint", "the light is a sphere of its radius")
+        return self._area_light(prim, LightKind.SPHERE, (radius, 0.0), sphere_area(linear, radius))
+
+    def _disk(self, prim: Usd.Prim, linear: F64) -> _Light | None:
+        radius = self._number(prim, "radius", 0.5)
+        return self._area_light(prim, LightKind.DISK, (radius, 0.0), disk_area(linear, radius))
+
+    def _rect(self, prim: Usd.Prim, linear: F64) -> _Light | None:
+        width, height = self._number(prim, "width", 1.0), self._number(prim, "height", 1.0)
+        texture = self._texture(prim, "clamp", "clamp")
+        return self._area_light(prim, LightKind.RECT, (width, height), rect_area(linear, width, height), texture)
+
+    def _cylinder(self, prim: Usd.Prim, linear: F64) -> _Light | None:
+        radius, length = self._number(prim, "radius", 0.5), self._number(prim, "length", 1.0)
+        if prim.GetAttribute("treatAsLine").Get(self.time):
+            self._unsupported(prim, "treatAsLine", "the light is a cylinder of its radius")
+        return self._area_light(prim, LightKind.CYLINDER, (radius, length), cylinder_area(linear, radius, length))
+
+    def _distant(self, prim: Usd.Prim, linear: F64) -> _Light | None:
+        half_angle = math.radians(min(max(self._number(prim, "angle", 0.53), 0.0), 360.0)) / 2.0
+        factor = distant_size_factor(half_angle)
+        return self._light(prim, LightKind.DISTANT, (half_angle, 0.0), self._radiance(prim, factor, 50000.0))
+
+    def _dome(self, prim: Usd.Prim, linear: F64) -> _Light | None:
+        # Ignores `normalize`: it has no size.
+        texture = self._texture(prim, "repeat", "clamp")
+        light = self._light(prim, LightKind.DOME, (0.0, 0.0), self._radiance(prim, None, 1.0), texture)
+        if str(prim.GetTypeName()) == "DomeLight_1" and self._pole_axis(prim) == "Z":
+            # A quarter turn about X takes the pole from +Y to +Z, longitude 0 from +Z to -Y.
+            turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+            light.to_world[:, :3] = light.to_world[:, :3] @ turn
+        return light
+
+    def _pole_axis(self, prim: Usd.Prim) -> str:
+        axis = str(prim.GetAttribute("poleAxis").Get() or "scene")
+        return str(UsdGeom.GetStageUpAxis(prim.GetStage())) if axis == "scene" else axis
+
+    def _area_light(
+        self, prim: Usd.Prim, kind: LightKind, size: tuple[float, float], area: float, texture: int = -1
+    ) -> _Light | None:
+        if not area > 0.0:
+            self.report.once(
+                prim.GetPath(),
+                "size",
+                f"{prim.GetPath()} has no area and gives no light; give it a size, or a transform that does not "
+                "flatten it.",
+            )
+            return None
+        return self._light(prim, kind, size, self._radiance(prim, area, 1.0), texture)
+
+    def _light(
+        self, prim: Usd.Prim, kind: LightKind, size: tuple[float, float], radiance: F64, texture: int = -1
+    ) -> _Light:
+        to_world = self.placement.matrix(self.transforms.GetLocalToWorldTransform(prim))
+        return _Light(str(prim.GetPath()), kind, to_world, radiance, size, texture)
+
+    # Inputs -------------------------------------------------------------------------------------
+
+    def _radiance(self, prim: Usd.Prim, size_factor: float | None, default_intensity: float) -> F64:
+        color = self._value(prim, "color", Gf.Vec3f(1.0))
+        radiance = np.array([float(c) for c in color], np.float64)
+        radiance *= self._number(prim, "intensity", default_intensity) * 2.0 ** self._number(prim, "exposure", 0.0)
+        if self._value(prim, "enableColorTemperature", False):
+            kelvin = self._number(prim, "colorTemperature", 6500.0)
+            radiance *= np.array(list(UsdLux.BlackbodyTemperatureAsRgb(kelvin)), np.float64)
+        if size_factor is not None and self._value(prim, "normalize", False):
+            radiance /= size_factor
+        return radiance
+
+    def _number(self, prim: Usd.Prim, name: str, default: float) -> float:
+        value = self._value(prim, name, default)
+        return float(value)
+
+    def _value(self, prim: Usd.Prim, name: str, default: Any) -> Any:
+        source = resolve_input(UsdShade.ConnectableAPI(prim), name, self.time)
+        if source.node is not None:
+            self._unsupported(prim, name, f"{source.node.GetPath()} is connected to it, and its plain value is used")
+            value = UsdShade.ConnectableAPI(prim).GetInput(name).GetAttr().Get(self.time)
+        else:
+            value = source.value
+        return default if value is None else value
+
+    def _texture(self, prim: Usd.Prim, wrap_s: str, wrap_t: str) -> int:
+        asset = self._value(prim, "texture:file", None)
+        if not isinstance(asset, Sdf.AssetPath) or not asset.path:
+            return -1
+        layout = self._value(prim, "texture:format", "automatic")
+        if layout not in ("automatic", "latlong"):
+            self._unsupported(prim, "texture:format", f"'{layout}' images are not read, and its plain colour is used")
+            return -1
+        return self.textures.add(asset, "auto", wrap_s, wrap_t, prim_path=str(prim.GetPath()))
+
+    # Findings -----------------------------------------------------------------------------------
+
+    def _unsupported(self, prim: Usd.Prim, feature: str, consequence: str) -> None:
+        self.report.once(prim.GetPath(), feature, f"{prim.GetPath()}: {feature} is not supported; {consequence}.")
+
+    def _report_kind(self, prim: Usd.Prim, kind: str) -> None:
+        if prim.IsA(UsdGeom.Mesh):
+            # Its material's emission lights the scene as any emissive mesh does; only what LightAPI adds is lost.
+            plain = all(
+                np.allclose(np.array(self._value(prim, name, default), np.float64), np.array(default, np.float64))
+                for name, default in (("color", (1.0, 1.0, 1.0)), ("intensity", 1.0), ("exposure", 0.0))
+            ) and not (self._value(prim, "normalize", False) or self._value(prim, "enableColorTemperature", False))
+            mode = prim.GetAttribute("light:materialSyncMode").Get() or "noMaterialResponse"
+            if mode != "materialGlowTintsLight":
+                self._unsupported(
+                    prim, "light:materialSyncMode", f"'{mode}' is ignored, and the mesh shines by its material alone"
+                )
+            elif not plain:
+                self._unsupported(prim, "MeshLightAPI", "its light inputs are ignored, and its material alone shines")
+            self._report_unsupported(prim, kind)
+            return
+        self._unsupported(prim, kind or "LightAPI", "it gives no light")
+
+    def _report_unsupported(self, prim: Usd.Prim, kind: str) -> None:
+        for name in ("diffuse", "specular"):
+            if self._number(prim, name, 1.0) != 1.0:
+                self._unsupported(prim, name, "the light acts on both responses in full")
+        light = UsdLux.LightAPI(prim)
+        for collection, what in (
+            (light.GetLightLinkCollectionAPI(), "lightLink"),
+            (light.GetShadowLinkCollectionAPI(), "shadowLink"),
+        ):
+            if not self._includes_everything(collection):
+                self._unsupported(prim, what, "the light acts on everything")
+        if light.GetFiltersRel().GetTargets():
+            self._unsupported(prim, "light:filters", "the light is not filtered")
+        self._report_shaping(prim, kind)
+        shadow = UsdLux.ShadowAPI(prim)
+        if shadow.GetShadowEnableAttr().Get(self.time) is False:
+            self._unsupported(prim, "shadow:enable", "the light casts shadows")
+        tint = shadow.GetShadowColorAttr().Get(self.time)
+        if tint is not None and any(c != 0.0 for c in tint):
+            self._unsupported(prim, "shadow:color", "its shadows are black")
+        for attribute, name in (
+            (shadow.GetShadowDistanceAttr(), "shadow:distance"),
+            (shadow.GetShadowFalloffAttr(), "shadow:falloff"),
+        ):
+            distance = attribute.Get(self.time)
+            if distance is not None and distance >= 0.0:
+                self._unsupported(prim, name, "its shadows reach everywhere")
+
+    @staticmethod
+    def _includes_everything(collection: Usd.CollectionAPI) -> bool:
+        if not collection:
+            return True
+        include_root = collection.GetIncludeRootAttr().Get()
+        expression = collection.GetMembershipExpressionAttr().Get()
+        return (
+            include_root is not False
+            and not collection.GetExcludesRel().GetTargets()
+            and not (expression is not None and str(expression))
+        )
+
+    def _report_shaping(self, prim: Usd.Prim, kind: str) -> None:
+        shaping = UsdLux.ShapingAPI(prim)
+        focus = shaping.GetShapingFocusAttr().Get(self.time)
+        if focus:
+            self._unsupported(prim, "shaping:focus", "the light spreads evenly")
+        cone = shaping.GetShapingConeAngleAttr()
+        # A cone of 90 degrees is all that a flat light fills, and what ShapingAPI falls back to.
+        widest = 90.0 if kind in ("RectLight", "DiskLight") or not cone.HasAuthoredValue() else 180.0
+        if cone and (cone.Get(self.time) or 0.0) < widest and cone.HasAuthoredValue():
+            self._unsupported(prim, "shaping:cone:angle", "the light is not cut to a cone")
+        profile = shaping.GetShapingIesFileAttr().Get(self.time)
+        if profile is not None and profile.path:
+            self._unsupported(prim, "shaping:ies:file", "the light has no profile")
