@@ -1,0 +1,108 @@
+"""Light that leaves the surfaces which gather rays hit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icheat_usd.kernels.gather import cosine_directions
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.lighting import LightSampler, irradiance
+from icheat_usd.materials import effective_albedo
+from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_origins
+
+INVERSE_PI = np.float32(1.0 / np.pi)
+
+
+def take(points: SurfacePoints, which: I64 | slice) -> SurfacePoints:
+    """Some of the points, as contiguous arrays."""
+    return SurfacePoints(*(np.ascontiguousarray(column[which]) for column in points))
+
+
+def trace_hemisphere(
+    snapshot: SceneSnapshot, tracer: Tracer, points: SurfacePoints, stream: I64, n_rays: int, seed: int
+) -> tuple[SurfacePoints, F32]:
+    """Cosine-weighted rays from each point to the first surfaces that scatter.
+
+    Returns
+    -------
+    points : SurfacePoints
+        (n * n_rays,) in the order of the rays.
+    throughput : (n * n_rays, 3) float32
+        Of the delta vertices in between; 0 where a ray left the scene or
+        pointed below the geometric surface.
+    """
+    n = len(stream)
+    directions = np.empty((n * n_rays, 3), np.float32)
+    cosine_directions(points.shading_normal, stream, n_rays, seed, directions)
+    positions = np.repeat(points.position, n_rays, axis=0)
+    normals = np.repeat(points.normal, n_rays, axis=0)
+    ends = first_surfaces(
+        snapshot, tracer, spawn_origins(positions, normals, directions), directions, int(hash_combine(seed, 1))
+    )
+    above = np.einsum("ij,ij->i", normals, directions) > 0
+    lit = above & (ends.points.instance >= 0)
+    return ends.points, np.where(lit[:, None], ends.throughput, np.float32(0))
+
+
+def reflected_radiance(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    points: SurfacePoints,
+    throughput: F32,
+    *,
+    n_bounces: int,
+    seed: int,
+) -> F32:
+    """Diffuse radiance that each point reflects, by one path per point.
+
+    Emission is not in it: emissive meshes and domes count as direct light.
+    Paths end after `n_bounces` reflections, or earlier by Russian roulette.
+
+    Parameters
+    ----------
+    points : SurfacePoints
+        (n,) hits of gather rays; those with `throughput` 0 are skipped.
+    throughput : (n, 3) float32
+        Carried into the result.
+
+    Returns
+    -------
+    (n, 3) float32, radiance, scene-linear
+    """
+    result = np.zeros_like(throughput)
+    alive = np.flatnonzero(throughput.any(axis=1))
+    carried = throughput[alive]
+    points = take(points, alive)
+    for bounce in range(n_bounces):
+        if len(alive) == 0:
+            break
+        step_seed = int(hash_combine(seed, bounce))
+        albedo = effective_albedo(points)
+        received = irradiance(snapshot, tracer, sampler, points, step_seed, 1).sum(axis=0)
+        result[alive] += carried * albedo * received * INVERSE_PI
+        if bounce + 1 == n_bounces:
+            break
+        carried = carried * albedo
+        # Survival by the reflectance of this vertex alone: the paths that carry most light live longest.
+        survival = np.clip(albedo.max(axis=1), np.float32(0.05), np.float32(0.95))
+        lives = np.flatnonzero(_uniforms(step_seed, alive) < survival)
+        alive, points = alive[lives], take(points, lives)
+        carried = carried[lives] / survival[lives, None]
+        points, through = trace_hemisphere(snapshot, tracer, points, alive, 1, int(hash_combine(step_seed, 2)))
+        carried = carried * through
+        lives = np.flatnonzero(carried.any(axis=1))
+        alive, carried, points = alive[lives], carried[lives], take(points, lives)
+    return result
+
+
+def _uniforms(seed: int, index: I64) -> F32:
+    """Uniform numbers in [0, 1) that depend on (seed, index) alone; PCG hash as in `kernels.random`."""
+    with np.errstate(over="ignore"):
+        x = index.astype(np.uint32) ^ np.uint32(seed)
+        for _ in range(2):
+            state = x * np.uint32(747796405) + np.uint32(2891336453)
+            word = ((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
+            x = (word >> np.uint32(22)) ^ word
+    return (x >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)

@@ -1,0 +1,272 @@
+"""Brute-force final gathering: every camera sample shoots its own gather rays.
+
+The plain version: no cache, no photon map, no denoiser. Slow and unbiased,
+apart from the limits below; what is faster is measured against it.
+
+Limits: all reflections before the last are diffuse; caustics through glass are
+left out of the lighting, as shadow rays pass straight through it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icheat_usd.edits.field import EditField
+from icheat_usd.edits.offsets import offset_radiance
+from icheat_usd.errors import EditError
+from icheat_usd.final_gather.hits import reflected_radiance, take, trace_hemisphere
+from icheat_usd.kernels.gather import point_sets
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.lighting import LightSampler, build_light_sampler, reflected_direct
+from icheat_usd.materials import is_glossy, sample_specular
+from icheat_usd.progress import Progress, silent
+from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
+from icheat_usd.samples.develop import average, develop
+from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_origins
+
+#: Gather rays in flight; bounds memory and keeps a chunk's arrays near the caches.
+RAYS_AT_ONCE = 1 << 19
+
+#: Light that leaves points on casters as the edits should see its colour, free of noise: (n,) points -> (n, 3).
+IncidentColor = Callable[[SurfacePoints], F32]
+
+
+@dataclass(frozen=True)
+class GatherSettings:
+    """Effort of a final gather."""
+
+    samples_per_pixel: int = 4
+    gather_rays: int = 64  #: per camera sample
+    light_samples: int = 4  #: shadow rays per light and camera sample, for direct light
+    n_bounces: int = 16  #: diffuse reflections before the last one
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FinalGather:
+    """Image layers, (height, width, 3) float64, scene-linear; `depth` is (height, width, 1)."""
+
+    background: F64
+    emission: F64
+    direct: F64
+    indirect: F64
+    indirect_edited: F64
+    albedo: F64
+    normal: F64
+    depth: F64
+
+
+class _Light(NamedTuple):
+    base: F32  #: (n, 3) indirect radiance without edits
+    edited: F32  #: (n, 3) with them
+
+
+@dataclass(frozen=True, eq=False)
+class _Gatherer:
+    """What every chunk of the gather needs."""
+
+    snapshot: SceneSnapshot
+    tracer: Tracer
+    sampler: LightSampler
+    field: EditField
+    incident_color: IncidentColor | None
+    offsets: GatherSamples | None
+    offset_radiance: F32 | None
+    settings: GatherSettings
+
+
+def final_gather(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    field: EditField,
+    *,
+    settings: GatherSettings = GatherSettings(),
+    gather: GatherSamples | None = None,
+    gather_radiance: F32 | None = None,
+    progress: Progress = silent,
+) -> FinalGather:
+    """Render direct and indirect light, the latter with and without edits.
+
+    The unedited image does not depend on the edits: both are formed from the
+    same rays, and pixels whose samples have no receiver mask above 0 hold the
+    same bits in both.
+
+    Parameters
+    ----------
+    field : EditField
+        The stack, bound to this snapshot.
+    gather, gather_radiance : GatherSamples and (n_gather, 3) float32, optional
+        The gather-sample solution of the relighter. Needed by operations that
+        depend on the colour of the light, whose ratio must not be formed from
+        single noisy rays, and by offsets, which are integrated over area.
+
+    Raises
+    ------
+    EditError
+        The stack needs the gather-sample solution and it was not given.
+    """
+    if (field.uses_incident or field.has_offset) and (gather is None or gather_radiance is None):
+        raise EditError("the edit stack needs the gather-sample solution: pass gather and gather_radiance")
+    incident = None
+    if gather is not None and gather_radiance is not None:
+        incident = _incident_from(gather, gather_radiance)
+    gatherer = _Gatherer(
+        snapshot, tracer, build_light_sampler(snapshot), field, incident, gather, gather_radiance, settings
+    )
+    totals: dict[str, F64] = {}
+    for index in range(settings.samples_per_pixel):
+        progress("gather", index / settings.samples_per_pixel)
+        view = view_samples(
+            snapshot,
+            tracer,
+            samples_per_pixel=settings.samples_per_pixel,
+            seed=settings.seed,
+            only_sample=index,
+            max_splits=0,
+        )
+        share = (index + np.array([0.0, 1.0])) / settings.samples_per_pixel
+        for name, values in _one_sample(gatherer, view, index, share, progress).items():
+            totals[name] = totals[name] + values if name in totals else values
+    progress("gather", 1.0)
+    n = settings.samples_per_pixel
+    for name in ("albedo", "normal", "depth"):
+        totals[name] /= n
+    return FinalGather(**totals)
+
+
+def _incident_from(gather: GatherSamples, radiance: F32) -> IncidentColor:
+    def color(points: SurfacePoints) -> F32:
+        return radiance[gather.locate(points)]
+
+    return color
+
+
+def _one_sample(
+    gatherer: _Gatherer, view: ViewSamples, index: int, share: F64, progress: Progress
+) -> dict[str, F64]:
+    """One camera sample of every pixel, as image layers."""
+    settings = gatherer.settings
+    seed = int(hash_combine(settings.seed, 1000 + index))
+    base = np.zeros((view.n, 3), np.float32)
+    edited = np.zeros((view.n, 3), np.float32)
+    direct = np.zeros((view.n, 3), np.float32)
+    step = max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
+    for begin in range(0, view.n, step):
+        progress("gather", float(share[0] + (share[1] - share[0]) * begin / max(view.n, 1)))
+        some = slice(begin, min(begin + step, view.n))
+        points = take(view.points, some)
+        to_eye = np.ascontiguousarray(view.to_eye[some])
+        stream = np.arange(some.start, some.stop, dtype=np.int64)
+        chunk_seed = int(hash_combine(seed, begin))
+        direct[some] = reflected_direct(
+            gatherer.snapshot, gatherer.tracer, gatherer.sampler, points, to_eye, chunk_seed, settings.light_samples
+        ).sum(axis=0)
+        light = _indirect(gatherer, points, to_eye, stream, chunk_seed)
+        base[some], edited[some] = light.base, light.edited
+    return {
+        "background": view.background.reshape(view.height, view.width, 3).astype(np.float64),
+        "emission": develop(view, view.points.emission),
+        "direct": develop(view, direct),
+        "indirect": develop(view, base),
+        "indirect_edited": develop(view, edited),
+        "albedo": average(view, view.points.albedo),
+        "normal": average(view, view.points.shading_normal),
+        "depth": average(view, view.depth[:, None]),
+    }
+
+
+def _indirect(gatherer: _Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, seed: int) -> _Light:
+    """Indirect radiance that the points send to the eye, unedited and edited."""
+    receiver = gatherer.field.receiver_masks(points)
+    touched = (receiver > 0).any(axis=0)
+    n_rays = gatherer.settings.gather_rays
+    hits, through = trace_hemisphere(gatherer.snapshot, gatherer.tracer, points, stream, n_rays, seed)
+    diffuse = _sum_rays(gatherer, hits, through, receiver, touched, n_rays, seed)
+    base = points.albedo * diffuse.base
+    edited = points.albedo * diffuse.edited
+    glossy = np.flatnonzero(is_glossy(points))
+    if len(glossy):
+        specular = _specular(gatherer, take(points, glossy), to_eye[glossy], stream[glossy], receiver[:, glossy], touched[glossy], seed)
+        base[glossy] += specular.base
+        edited[glossy] += specular.edited
+    if gatherer.field.has_offset and touched.any():
+        which = np.flatnonzero(touched)
+        gather, b = gatherer.offsets, gatherer.offset_radiance
+        assert gather is not None and b is not None
+        casters = gatherer.field.caster_masks(gather.points)
+        edited[which] += offset_radiance(gatherer.field, b, gather.area, receiver[:, which], casters, points.albedo[which])
+    edited = np.where(touched[:, None], np.maximum(edited, np.float32(0)), base)
+    return _Light(base, edited)
+
+
+def _specular(
+    gatherer: _Gatherer,
+    points: SurfacePoints,
+    to_eye: F32,
+    stream: I64,
+    receiver: F32,
+    touched: np.ndarray,
+    seed: int,
+) -> _Light:
+    """The specular lobe's share, by rays that follow the lobe."""
+    n_rays = gatherer.settings.gather_rays
+    seed = int(hash_combine(seed, 7))
+    repeated = SurfacePoints(*(np.repeat(column, n_rays, axis=0) for column in points))
+    u = _lobe_numbers(stream, n_rays, seed)
+    directions, base_weight, edge_weight = sample_specular(repeated, np.repeat(to_eye, n_rays, axis=0), u)
+    ends = first_surfaces(
+        gatherer.snapshot,
+        gatherer.tracer,
+        spawn_origins(repeated.position, repeated.normal, directions),
+        directions,
+        int(hash_combine(seed, 1)),
+    )
+    reflectance = base_weight[:, None] * repeated.specular + (edge_weight * repeated.specular_edge)[:, None]
+    lit = (ends.points.instance >= 0)[:, None]
+    through = np.where(lit, reflectance * ends.throughput, np.float32(0)).astype(np.float32)
+    return _sum_rays(gatherer, ends.points, through, receiver, touched, n_rays, int(hash_combine(seed, 2)))
+
+
+def _lobe_numbers(stream: I64, n_rays: int, seed: int) -> F32:
+    out = np.empty((len(stream) * n_rays, 2), np.float32)
+    point_sets(stream, n_rays, seed, out)
+    return out
+
+
+def _sum_rays(
+    gatherer: _Gatherer, hits: SurfacePoints, through: F32, receiver: F32, touched: np.ndarray, n_rays: int, seed: int
+) -> _Light:
+    """Mean over each point's rays of the light they bring, unedited and edited."""
+    brought = reflected_radiance(
+        gatherer.snapshot,
+        gatherer.tracer,
+        gatherer.sampler,
+        hits,
+        through,
+        n_bounces=gatherer.settings.n_bounces,
+        seed=int(hash_combine(seed, 11)),
+    )
+    base = _mean(brought, n_rays)
+    edited = base.copy()
+    rays = np.flatnonzero(np.repeat(touched, n_rays) & through.any(axis=1))
+    if len(rays):
+        some = take(hits, rays)
+        caster = gatherer.field.caster_masks(some)
+        color = np.zeros((len(rays), 3), np.float32)
+        if gatherer.incident_color is not None:
+            color = gatherer.incident_color(some)
+        coefficients = gatherer.field.evaluate(color, receiver[:, rays // n_rays], caster)
+        changed = brought.copy()
+        changed[rays] = coefficients.scale * brought[rays] + coefficients.emission * through[rays]
+        which = np.flatnonzero(touched)
+        edited[which] = _mean(changed.reshape(-1, n_rays, 3)[which].reshape(-1, 3), n_rays)
+    return _Light(base, edited)
+
+
+def _mean(values: F32, n_rays: int) -> F32:
+    return values.reshape(-1, n_rays, 3).sum(axis=1, dtype=np.float64).astype(np.float32) / np.float32(n_rays)

@@ -1,0 +1,44 @@
+"""Places of mask texels on surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import parallel_kernel
+
+
+@parallel_kernel
+def texel_positions(face_begin, points, face_uv, resolution, out):  # type: ignore[no-untyped-def]
+    """World position of each texel centre of each control face.
+
+    Triangles are sorted by face; those of face `f` are rows
+    ``face_begin[f]:face_begin[f + 1]`` of `points` and `face_uv` (n, 3, ...).
+    A texel outside all triangles of its face (the far half of a triangular
+    face) extends the triangle that it misses by least.
+    """
+    for f in prange(len(face_begin) - 1):
+        for y in range(resolution):
+            for x in range(resolution):
+                s = (x + 0.5) / resolution
+                t = (y + 0.5) / resolution
+                nearest = -1e30
+                for k in range(face_begin[f], face_begin[f + 1]):
+                    ux = face_uv[k, 1, 0] - face_uv[k, 0, 0]
+                    uy = face_uv[k, 1, 1] - face_uv[k, 0, 1]
+                    vx = face_uv[k, 2, 0] - face_uv[k, 0, 0]
+                    vy = face_uv[k, 2, 1] - face_uv[k, 0, 1]
+                    area = ux * vy - uy * vx
+                    if area == 0.0:
+                        continue
+                    px = s - face_uv[k, 0, 0]
+                    py = t - face_uv[k, 0, 1]
+                    b1 = (px * vy - py * vx) / area
+                    b2 = (ux * py - uy * px) / area
+                    inside = min(min(b1, b2), 1.0 - b1 - b2)
+                    if inside > nearest:
+                        nearest = inside
+                        for axis in range(3):
+                            out[f, y, x, axis] = np.float32(
+                                (1.0 - b1 - b2) * points[k, 0, axis] + b1 * points[k, 1, axis] + b2 * points[k, 2, axis]
+                            )

@@ -1,0 +1,1 @@
+"""Other renderers given the same scene, to compare with."""
