@@ -6,17 +6,37 @@ import math
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import parallel_kernel
+from icheat_usd.kernels.environment import F32, Table
 from icheat_usd.kernels.lights import sample_analytic, sample_mesh
 from icheat_usd.kernels.random import hash_combine, sobol_pair
+
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
 
 
 @parallel_kernel
 def fill_analytic(
-    lights, textures, tables, light, position, normal, shading_normal, instance, first, n_samples, seed, cosine,
-    direction, distance, pdf, radiance,
-):  # fmt: skip
+    lights: Table,
+    textures: Table,
+    tables: Table,
+    light: int,
+    position: F32,
+    normal: F32,
+    shading_normal: F32,
+    instance: I32,
+    first: int,
+    n_samples: int,
+    seed: int,
+    cosine: bool,
+    direction: F32,
+    distance: F32,
+    pdf: F32,
+    radiance: F32,
+) -> None:
     """Shadow rays of every point to one light that is no mesh.
 
     Rows of the outputs are point-major, `n_samples` each. `radiance` holds L / (pdf n_samples),
@@ -55,9 +75,27 @@ def fill_analytic(
 
 @parallel_kernel
 def fill_mesh(
-    lights, tables, light, position, normal, shading_normal, instance, first, n_samples, seed, cosine,
-    direction, distance, pdf, radiance, emissive, barycentric, light_point, light_normal, light_side,
-):  # fmt: skip
+    lights: Table,
+    tables: Table,
+    light: int,
+    position: F32,
+    normal: F32,
+    shading_normal: F32,
+    instance: I32,
+    first: int,
+    n_samples: int,
+    seed: int,
+    cosine: bool,
+    direction: F32,
+    distance: F32,
+    pdf: F32,
+    radiance: F32,
+    emissive: I64,
+    barycentric: F32,
+    light_point: F32,
+    light_normal: F32,
+    light_side: U8,
+) -> None:
     """Shadow rays of every point to one MESH light; as `fill_analytic`.
 
     `radiance` lacks the emission of textured triangles, whose rows and places are in `emissive`
@@ -105,7 +143,7 @@ def fill_mesh(
 
 
 @parallel_kernel
-def sum_rays(values, begin, out):
+def sum_rays(values: F32, begin: I64, out: F32) -> None:
     """out[p] += sum of the rows begin[p]:begin[p + 1] of `values` (m, 3)."""
     for i in prange(out.shape[0]):
         r = 0.0

@@ -10,15 +10,25 @@ UsdLux adopts [1]_. The centre of the image looks along +Z, its left quarter alo
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 
+Array = NDArray[Any]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Table = Any  # a named tuple of arrays
+Floats = tuple[float, ...]
+
 
 @kernel
-def image_bilinear(texels, begin, width, height, s, t, repeat_s):
+def image_bilinear(
+    texels: F32, begin: int, width: int, height: int, s: float, t: float, repeat_s: bool
+) -> tuple[float, float, float]:
     """Bilinear lookup with texel centres at half integers; t is clamped, s repeats or is clamped."""
     x = s * width - 0.5
     y = t * height - 0.5
@@ -52,7 +62,7 @@ def image_bilinear(texels, begin, width, height, s, t, repeat_s):
 
 
 @kernel
-def latlong_coordinates(x, y, z):
+def latlong_coordinates(x: float, y: float, z: float) -> tuple[float, float]:
     """Image coordinates (s, t) of a unit direction in the dome's frame; t grows downwards."""
     s = 0.5 - math.atan2(x, z) / (2.0 * math.pi)
     t = math.acos(min(max(y, -1.0), 1.0)) / math.pi
@@ -60,7 +70,7 @@ def latlong_coordinates(x, y, z):
 
 
 @kernel
-def dome_lookup(textures, texture, x, y, z):
+def dome_lookup(textures: Table, texture: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Radiance of a lat-long image in a unit direction of the dome's frame."""
     s, t = latlong_coordinates(x, y, z)
     return image_bilinear(
@@ -69,7 +79,7 @@ def dome_lookup(textures, texture, x, y, z):
 
 
 @kernel
-def _mean_over_texel(texels, begin, width, height, column, row):
+def _mean_over_texel(texels: F32, begin: int, width: int, height: int, column: int, row: int) -> float:
     """Luminance of the bilinear image averaged over one texel: a (1 6 1)/8 filter per axis."""
     total = 0.0
     for j in range(-1, 2):
@@ -84,7 +94,7 @@ def _mean_over_texel(texels, begin, width, height, column, row):
 
 
 @parallel_kernel
-def dome_columns_cdf(texels, begin, width, height, cdf, row_weight):
+def dome_columns_cdf(texels: F32, begin: int, width: int, height: int, cdf: F32, row_weight: F64) -> None:
     """Cumulative probability along each row, normalised, and the weight of each row.
 
     Texel weight = luminance of the *bilinear* image averaged over the texel x its solid angle,
@@ -103,7 +113,7 @@ def dome_columns_cdf(texels, begin, width, height, cdf, row_weight):
 
 
 @kernel
-def search_cdf(cdf, begin, end, u):
+def search_cdf(cdf: F64, begin: int, end: int, u: float) -> int:
     """First row k in [begin, end) with cdf[k] > u; a row of zero probability is never found."""
     low = begin
     high = end - 1
@@ -117,7 +127,9 @@ def search_cdf(cdf, begin, end, u):
 
 
 @kernel
-def sample_dome_image(rows_cdf, rows_begin, columns_cdf, columns_begin, width, height, u1, u2):
+def sample_dome_image(
+    rows_cdf: F64, rows_begin: int, columns_cdf: F32, columns_begin: int, width: int, height: int, u1: float, u2: float
+) -> Floats:
     """Direction in the dome's frame and its probability per solid angle.
 
     A texel is chosen in proportion to its weight, then a direction uniform in solid angle in it.
@@ -143,7 +155,17 @@ def sample_dome_image(rows_cdf, rows_begin, columns_cdf, columns_begin, width, h
 
 
 @kernel
-def dome_image_pdf(rows_cdf, rows_begin, columns_cdf, columns_begin, width, height, x, y, z):
+def dome_image_pdf(
+    rows_cdf: F64,
+    rows_begin: int,
+    columns_cdf: F32,
+    columns_begin: int,
+    width: int,
+    height: int,
+    x: float,
+    y: float,
+    z: float,
+) -> float:
     """Probability per solid angle with which `sample_dome_image` returns a unit direction."""
     s, t = latlong_coordinates(x, y, z)
     row = min(max(int(t * height), 0), height - 1)
@@ -156,7 +178,7 @@ def dome_image_pdf(rows_cdf, rows_begin, columns_cdf, columns_begin, width, heig
 
 
 @parallel_kernel
-def dome_radiance(textures, texture, radiance, to_local, directions, out):
+def dome_radiance(textures: Table, texture: int, radiance: F32, to_local: F64, directions: F32, out: F32) -> None:
     """Add one dome's radiance in world directions (any length) to `out` (n, 3)."""
     for i in prange(directions.shape[0]):
         dx = float(directions[i, 0])

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel
 from icheat_usd.kernels.environment import (
+    Array,
+    Floats,
+    Table,
     dome_lookup,
     image_bilinear,
     sample_dome_image,
@@ -43,17 +46,17 @@ class LightTables(NamedTuple):
 
 
 @kernel
-def _dot(ax, ay, az, bx, by, bz):
+def _dot(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
     return ax * bx + ay * by + az * bz
 
 
 @kernel
-def _cross(ax, ay, az, bx, by, bz):
+def _cross(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> Floats:
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 @kernel
-def _normalized(x, y, z):
+def _normalized(x: float, y: float, z: float) -> Floats:
     length = math.sqrt(x * x + y * y + z * z)
     if length == 0.0:
         return 0.0, 0.0, 0.0
@@ -61,7 +64,7 @@ def _normalized(x, y, z):
 
 
 @kernel
-def _linear(m, x, y, z):
+def _linear(m: Array, x: float, y: float, z: float) -> Floats:
     """M (x, y, z) for the 3 x 3 part of `m`."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
@@ -71,7 +74,7 @@ def _linear(m, x, y, z):
 
 
 @kernel
-def orthonormal_basis(nx, ny, nz):
+def orthonormal_basis(nx: float, ny: float, nz: float) -> Floats:
     """Two unit vectors that complete a unit normal (Duff et al. 2017, JCGT 6(1))."""
     sign = math.copysign(1.0, nz)
     a = -1.0 / (sign + nz)
@@ -80,7 +83,7 @@ def orthonormal_basis(nx, ny, nz):
 
 
 @kernel
-def _unit_disk(u1, u2):
+def _unit_disk(u1: float, u2: float) -> Floats:
     """Concentric map of the unit square to the unit disk (Shirley & Chiu 1997)."""
     a = 2.0 * u1 - 1.0
     b = 2.0 * u2 - 1.0
@@ -96,12 +99,12 @@ def _unit_disk(u1, u2):
 
 
 @kernel
-def _to_solid_angle(pdf_world_area, distance, cosine):
+def _to_solid_angle(pdf_world_area: float, distance: float, cosine: float) -> float:
     return pdf_world_area * distance * distance / cosine
 
 
 @kernel
-def _plane_axes(m):
+def _plane_axes(m: Array) -> Floats:
     """World tangents of a disk or rect, its unit normal on the emitting (-Z) side, and |Mx x My|."""
     ax, ay, az = m[0, 0] * 1.0, m[1, 0] * 1.0, m[2, 0] * 1.0
     bx, by, bz = m[0, 1] * 1.0, m[1, 1] * 1.0, m[2, 1] * 1.0
@@ -115,7 +118,7 @@ def _plane_axes(m):
 
 
 @kernel
-def _spherical_rectangle(ex, ey, x0, y0, z0):
+def _spherical_rectangle(ex: float, ey: float, x0: float, y0: float, z0: float) -> Floats:
     """Constants of Urena et al. 2013 for a rectangle [x0, x0 + ex] x [y0, y0 + ey] at depth z0 < 0."""
     x1 = x0 + ex
     y1 = y0 + ey
@@ -139,7 +142,19 @@ _SMALLEST_SPHERICAL_RECTANGLE = 1e-7
 
 
 @kernel
-def _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, z0, x1, y1, u1, u2):
+def _sample_spherical_rectangle(
+    b0: float,
+    b1: float,
+    k: float,
+    solid_angle: float,
+    x0: float,
+    y0: float,
+    z0: float,
+    x1: float,
+    y1: float,
+    u1: float,
+    u2: float,
+) -> Floats:
     au = u1 * solid_angle + k
     fu = (math.cos(au) * b0 - b1) / math.sin(au)
     cu = math.copysign(1.0, fu) / math.sqrt(fu * fu + b0 * b0)
@@ -155,7 +170,7 @@ def _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, z0, x1, y1, u1, 
 
 
 @kernel
-def _rect_radiance(lights, textures, light, x, y):
+def _rect_radiance(lights: Table, textures: Table, light: int, x: float, y: float) -> Floats:
     """Image of a textured rect at (x, y) in [0, 1]^2 of its plane: upright for who looks at its lit side."""
     texture = lights.texture[light]
     if texture < 0:
@@ -172,7 +187,9 @@ def _rect_radiance(lights, textures, light, x, y):
 
 
 @kernel
-def _sample_rect(lights, textures, light, px, py, pz, u1, u2):
+def _sample_rect(
+    lights: Table, textures: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+) -> Floats:
     m = lights.to_world[light]
     ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
     width = float(lights.size[light, 0])
@@ -212,7 +229,7 @@ def _sample_rect(lights, textures, light, px, py, pz, u1, u2):
 
 
 @kernel
-def _sample_disk(lights, light, px, py, pz, u1, u2):
+def _sample_disk(lights: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float) -> Floats:
     m = lights.to_world[light]
     ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
     radius = float(lights.size[light, 0])
@@ -231,7 +248,7 @@ def _sample_disk(lights, light, px, py, pz, u1, u2):
 
 
 @kernel
-def _direction_scale(m, determinant, x, y, z):
+def _direction_scale(m: Array, determinant: float, x: float, y: float, z: float) -> float:
     """World solid angle pdf over local one, for the unit local direction (x, y, z)."""
     wx, wy, wz = _linear(m, x, y, z)
     length = math.sqrt(_dot(wx, wy, wz, wx, wy, wz))
@@ -239,7 +256,9 @@ def _direction_scale(m, determinant, x, y, z):
 
 
 @kernel
-def _sample_sphere(lights, tables, light, px, py, pz, u1, u2):
+def _sample_sphere(
+    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+) -> Floats:
     """Cone that the sphere fills, in the space where it is the unit sphere; emits outwards only."""
     m = lights.to_world[light]
     radius = float(lights.size[light, 0])
@@ -275,7 +294,9 @@ def _sample_sphere(lights, tables, light, px, py, pz, u1, u2):
 
 
 @kernel
-def _sample_cylinder(lights, tables, light, px, py, pz, u1, u2):
+def _sample_cylinder(
+    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+) -> Floats:
     """Lateral surface about X, the part of it that faces the point; no caps, emits outwards only."""
     m = lights.to_world[light]
     radius = float(lights.size[light, 0])
@@ -308,7 +329,7 @@ def _sample_cylinder(lights, tables, light, px, py, pz, u1, u2):
 
 
 @kernel
-def _sample_distant(lights, light, u1, u2):
+def _sample_distant(lights: Table, light: int, u1: float, u2: float) -> Floats:
     """Cone about local +Z; a half-angle of zero is one direction whose `radiance` is an irradiance (pdf 1)."""
     m = lights.to_world[light]
     zx, zy, zz = _normalized(m[0, 2] * 1.0, m[1, 2] * 1.0, m[2, 2] * 1.0)
@@ -337,7 +358,9 @@ def _sample_distant(lights, light, u1, u2):
 
 
 @kernel
-def _sample_dome(lights, textures, tables, light, nx, ny, nz, u1, u2):
+def _sample_dome(
+    lights: Table, textures: Table, tables: Table, light: int, nx: float, ny: float, nz: float, u1: float, u2: float
+) -> Floats:
     """Textured: in proportion to the image. Untextured: cosine about the normal (nx, ny, nz)."""
     texture = lights.texture[light]
     if texture < 0:
@@ -377,7 +400,20 @@ def _sample_dome(lights, textures, tables, light, nx, ny, nz, u1, u2):
 
 
 @kernel
-def sample_analytic(lights, textures, tables, light, px, py, pz, nx, ny, nz, u1, u2):
+def sample_analytic(
+    lights: Table,
+    textures: Table,
+    tables: Table,
+    light: int,
+    px: float,
+    py: float,
+    pz: float,
+    nx: float,
+    ny: float,
+    nz: float,
+    u1: float,
+    u2: float,
+) -> Floats:
     """Direction to the light (3), distance, pdf per solid angle, radiance (3), for every kind but MESH.
 
     Radiance is relative to `lights.radiance`. pdf 0 means that the light does not reach the point.
@@ -397,7 +433,9 @@ def sample_analytic(lights, textures, tables, light, px, py, pz, nx, ny, nz, u1,
 
 
 @kernel
-def sample_mesh(lights, tables, light, px, py, pz, u1, u2):
+def sample_mesh(
+    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+) -> Floats:
     """Row of the emissive tables, barycentric (2), point (3), unit geometric normal (3), pdf per solid angle."""
     begin = lights.triangle_begin[light]
     row = search_cdf(tables.triangle_cdf, begin, lights.triangle_begin[light + 1], u1)

@@ -138,7 +138,7 @@ class _ShadowRays:
 
 
 def _take(points: SurfacePoints, rows: slice | I64) -> SurfacePoints:
-    return SurfacePoints(*(np.require(column[rows], None, ("C", "W")) for column in points))
+    return SurfacePoints._make(np.require(column[rows], None, ("C", "W")) for column in points)
 
 
 def _shadow_rays(
