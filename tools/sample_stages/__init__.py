@@ -1,0 +1,43 @@
+"""The sample stages, one module each, and what they are made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+from pxr import Sdf
+
+from . import animated_room, cornell_box, furnished_room, glossy_set, images, staircase
+from .build import write_over_layer
+
+STAGES: dict[str, ModuleType] = {
+    module.NAME: module for module in (cornell_box, furnished_room, glossy_set, staircase, animated_room)
+}
+
+
+def build_stage(name: str, folder: Path) -> None:
+    """Write one sample stage: scene.usda, textures, sequence.usda and shot.usda with their edits."""
+    module = STAGES[name]
+    module.build(folder)
+    write_over_layer(folder / "sequence.usda", "scene.usda", "", module.FRAMES)
+    write_over_layer(folder / "shot.usda", "sequence.usda", "", module.FRAMES)
+
+
+def differences(committed: Path, rebuilt: Path) -> list[str]:
+    """One line for each file that is missing, superfluous or says something else; encodings do not count."""
+    old = {path.relative_to(committed) for path in committed.rglob("*") if path.is_file()}
+    new = {path.relative_to(rebuilt) for path in rebuilt.rglob("*") if path.is_file()}
+    found = [f"{committed / path}: not committed" for path in sorted(new - old)]
+    found += [f"{committed / path}: nothing makes this file" for path in sorted(old - new)]
+    for path in sorted(old & new):
+        if _content(committed / path) != _content(rebuilt / path):
+            found.append(f"{committed / path}: differs from what tools/make_sample_stages writes")
+    return found
+
+
+def _content(path: Path) -> object:
+    if path.suffix == ".usda":
+        return Sdf.Layer.OpenAsAnonymous(str(path)).ExportToString()
+    if path.suffix == ".png":
+        return images.png_content(path.read_bytes())
+    return path.read_bytes()

@@ -1,0 +1,44 @@
+"""Glossy and diffuse things beside a blue wall."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from . import images
+from .build import StageBuilder
+from .shapes import box, lathe, quad
+
+NAME = "glossy_set"
+FRAMES = None
+DOC = """A table-top set: a glossy cone, a glossy sphere and a diffuse box between a blue wall and a pale one. The lamp
+faces the blue wall, so what the things show on that side is light the wall sent on, diffuse on the box and as a
+blurred reflection on cone and sphere: the two lobes an edit of the wall's light has to reach together."""
+
+
+def build(folder: Path) -> None:
+    images.write_png(folder / "textures/checker.png", images.checker())
+    b = StageBuilder(DOC)
+    b.material("Blue", (0.05, 0.13, 0.58))
+    b.material("Pale", (0.70, 0.67, 0.61))
+    b.material("Tiles", (0.4, 0.4, 0.4), texture="./textures/checker.png", texture_scale=(6, 6))
+    b.material("Cone", (0.58, 0.36, 0.10), roughness=0.28, ior=1.6)
+    b.material("Sphere", (0.92, 0.90, 0.88), roughness=0.22, metallic=1.0, ior=1.5)
+    b.material("Box", (0.66, 0.30, 0.14))
+    b.material("Ring", (0.55, 0.06, 0.08), roughness=0.35, ior=1.5)
+
+    room = b.component("Set")
+    b.mesh(f"{room}/Floor", quad([(-2, 0, 2.6), (2.4, 0, 2.6), (2.4, 0, -1.6), (-2, 0, -1.6)]), "Tiles")
+    b.mesh(f"{room}/BlueWall", quad([(-2, 0, 2.6), (-2, 0, -1.6), (-2, 2.6, -1.6), (-2, 2.6, 2.6)]), "Blue")
+    b.mesh(f"{room}/PaleWall", quad([(-2, 0, -1.6), (2.4, 0, -1.6), (2.4, 2.6, -1.6), (-2, 2.6, -1.6)]), "Pale")
+
+    things = b.component("Things")
+    b.cone(f"{things}/Cone", 0.48, 1.25, "Cone", (-1.02, 0.625, -0.45))
+    b.sphere(f"{things}/Sphere", 0.5, "Sphere", (0.22, 0.5, 0.18))
+    b.mesh(f"{things}/Box", box((0.62, 0.78, 0.62)), "Box", (1.22, 0, -0.55), (0, 24, 0))
+    ring = [(0.20, 0.0), (0.27, 0.0), (0.30, 0.05), (0.27, 0.10), (0.20, 0.10), (0.17, 0.05), (0.20, 0.0)]
+    b.mesh(f"{things}/Ring", lathe(ring[:-1] + [ring[0]], 16, closed=False), "Ring", (-0.55, 0, 0.85), smooth=True)
+
+    b.rect_light("/World/Lights/Key", (1.0, 1.0), (9.0, 8.6, 8.0), (0.9, 2.5, 0.6), (-38, 68, 0))
+    main = b.camera("Main", (0.95, 1.28, 4.1), (-0.12, 0.52, -0.3), 42)
+    b.render_settings(main)
+    b.save(folder / "scene.usda")
