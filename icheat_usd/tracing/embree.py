@@ -1,0 +1,207 @@
+"""The fast tracer: Embree 4, from the library that the embreex wheel carries, called by compiled loops."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import weakref
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.errors import IcheatError
+from icheat_usd.kernels.embree import intersect_packets, occluded_packets
+from icheat_usd.scene import F32, Bool, Geometry, Hits, SceneSnapshot
+from icheat_usd.tracing._rays import checked_rays
+
+# Values from Embree 4's rtcore headers.
+_GEOMETRY_TRIANGLE, _GEOMETRY_INSTANCE = 0, 121
+_BUFFER_INDEX, _BUFFER_VERTEX = 0, 1
+_FORMAT_UINT3, _FORMAT_FLOAT3, _FORMAT_FLOAT3X4_ROW_MAJOR = 0x5003, 0x9003, 0x9134
+_SCENE_ROBUST = 1 << 2
+
+#: Meshes placed more than once are copied into world space while all copies together have at most so many triangles;
+#: beyond it they become Embree instances.
+COPIED_TRIANGLES = 1_000_000
+
+
+@functools.cache
+def _library() -> ctypes.CDLL:
+    try:
+        import embreex.rtcore  # loads libembree4 and the libtbb next to it
+    except ImportError as error:
+        raise IcheatError(
+            "The Embree tracer needs the package 'embreex' (>= 4.4), which could not be imported; "
+            "install it or choose engine='reference'."
+        ) from error
+    package = Path(embreex.__file__).parent
+    found = sorted([*package.parent.glob("embreex.libs/libembree4*"), *package.glob("**/*embree4*")])
+    if not found:
+        raise IcheatError(
+            f"No libembree4 beside {package}; the Embree tracer expects the wheel of embreex >= 4.4: reinstall it."
+        )
+    library = ctypes.CDLL(str(found[0]))
+    handle, uint = ctypes.c_void_p, ctypes.c_uint
+    signatures: dict[str, tuple[Any, list[Any]]] = {
+        "rtcNewDevice": (handle, [ctypes.c_char_p]),
+        "rtcReleaseDevice": (None, [handle]),
+        "rtcGetDeviceError": (ctypes.c_int, [handle]),
+        "rtcNewScene": (handle, [handle]),
+        "rtcReleaseScene": (None, [handle]),
+        "rtcSetSceneFlags": (None, [handle, ctypes.c_int]),
+        "rtcCommitScene": (None, [handle]),
+        "rtcNewGeometry": (handle, [handle, ctypes.c_int]),
+        "rtcReleaseGeometry": (None, [handle]),
+        "rtcCommitGeometry": (None, [handle]),
+        "rtcAttachGeometryByID": (None, [handle, handle, uint]),
+        "rtcSetNewGeometryBuffer": (
+            handle,
+            [handle, ctypes.c_int, uint, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t],
+        ),
+        "rtcSetGeometryInstancedScene": (None, [handle, handle]),
+        "rtcSetGeometryTransform": (None, [handle, uint, ctypes.c_int, handle]),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
+
+
+def _address(name: str) -> int:
+    return ctypes.cast(getattr(_library(), name), ctypes.c_void_p).value or 0
+
+
+def _release(library: ctypes.CDLL, device: int, scenes: list[int]) -> None:
+    for scene in reversed(scenes):
+        library.rtcReleaseScene(scene)
+    library.rtcReleaseDevice(device)
+
+
+class EmbreeTracer:
+    """Nearest hits and occlusion against every triangle of every instance.
+
+    A mesh placed once, or few times, is copied into world space; others are
+    single-level Embree instances, so that 70,000 placements share one mesh.
+    Embree owns its copy of the vertices: the snapshot may go.
+
+    Raises
+    ------
+    IcheatError
+        embreex is not installed, or Embree ran out of memory.
+    """
+
+    def __init__(self, snapshot: SceneSnapshot, *, copied_triangles: int = COPIED_TRIANGLES) -> None:
+        self._mesh_begin = snapshot.geometry.mesh_begin
+        self._instance_mesh = snapshot.geometry.instance_mesh
+        self._functions = {name: _address(name) for name in ("rtcIntersect16", "rtcOccluded16")}
+        library = _library()
+        self._device: int = library.rtcNewDevice(b"verbose=0")
+        if not self._device:
+            raise IcheatError(f"Embree could not start (error {library.rtcGetDeviceError(None)}).")
+        scenes: list[int] = []
+        self._finalizer = weakref.finalize(self, _release, library, self._device, scenes)
+        self._scene = self._build(snapshot.geometry, scenes, copied_triangles)
+        if error := library.rtcGetDeviceError(self._device):
+            self.close()
+            raise IcheatError(
+                f"Embree could not build {snapshot.stage_path or 'the scene'} (error {error}: "
+                f"{'out of memory' if error == 4 else 'see RTCError'}); reduce its subdivision level."
+            )
+
+    def close(self) -> None:
+        """Release Embree's memory now; also happens when the tracer is garbage. Do not trace afterwards."""
+        self._scene = 0
+        self._finalizer()
+
+    def _new_scene(self, scenes: list[int]) -> int:
+        library = _library()
+        scene: int = library.rtcNewScene(self._device)
+        scenes.append(scene)
+        library.rtcSetSceneFlags(scene, _SCENE_ROBUST)
+        return scene
+
+    def _attach_triangles(self, scene: int, corners: F32, geometry_id: int) -> None:
+        library = _library()
+        n = len(corners)
+        geometry = library.rtcNewGeometry(self._device, _GEOMETRY_TRIANGLE)
+        # Buffers made by Embree end in the padding that its 16-byte loads need.
+        vertices = library.rtcSetNewGeometryBuffer(geometry, _BUFFER_VERTEX, 0, _FORMAT_FLOAT3, 12, 3 * n)
+        indices = library.rtcSetNewGeometryBuffer(geometry, _BUFFER_INDEX, 0, _FORMAT_UINT3, 12, n)
+        if vertices and indices:
+            ctypes.memmove(vertices, corners.ctypes.data, corners.nbytes)
+            order = np.arange(3 * n, dtype=np.uint32)
+            ctypes.memmove(indices, order.ctypes.data, order.nbytes)
+            library.rtcCommitGeometry(geometry)
+            library.rtcAttachGeometryByID(scene, geometry, geometry_id)
+        library.rtcReleaseGeometry(geometry)
+
+    def _build(self, geometry: Geometry, scenes: list[int], copied_triangles: int) -> int:
+        library = _library()
+        size = np.diff(geometry.mesh_begin)
+        uses = np.bincount(geometry.instance_mesh, minlength=len(size))
+        copies = np.where(uses > 1, size * uses, 0)
+        order = np.argsort(copies, kind="stable")
+        shared = np.zeros(len(size), bool)
+        shared[order] = (np.cumsum(copies[order]) > copied_triangles) & (copies[order] > 0)
+
+        top = self._new_scene(scenes)
+        prototypes: dict[int, int] = {}
+        for instance, mesh in enumerate(geometry.instance_mesh.tolist()):
+            if size[mesh] == 0:
+                continue
+            corners = geometry.points[geometry.mesh_begin[mesh] : geometry.mesh_begin[mesh + 1]]
+            matrix = geometry.instance_to_world[instance]
+            if not shared[mesh]:
+                world = corners.astype(np.float64) @ matrix[:, :3].T.astype(np.float64) + matrix[:, 3]
+                self._attach_triangles(top, np.ascontiguousarray(world, np.float32), instance)
+                continue
+            if mesh not in prototypes:
+                prototypes[mesh] = self._new_scene(scenes)
+                self._attach_triangles(prototypes[mesh], np.ascontiguousarray(corners), 0)
+                library.rtcCommitScene(prototypes[mesh])
+            placed = library.rtcNewGeometry(self._device, _GEOMETRY_INSTANCE)
+            library.rtcSetGeometryInstancedScene(placed, prototypes[mesh])
+            rows = np.ascontiguousarray(matrix, np.float32)
+            library.rtcSetGeometryTransform(placed, 0, _FORMAT_FLOAT3X4_ROW_MAJOR, rows.ctypes.data)
+            library.rtcCommitGeometry(placed)
+            library.rtcAttachGeometryByID(top, placed, instance)
+            library.rtcReleaseGeometry(placed)
+        library.rtcCommitScene(top)
+        return top
+
+    def intersect(self, origins: F32, directions: F32, t_max: F32 | float | None = None) -> Hits:
+        """See `Tracer.intersect`."""
+        origins, directions, t_max = checked_rays(origins, directions, t_max)
+        n = len(origins)
+        hits = Hits(
+            np.empty(n, np.float32),
+            np.empty(n, np.int32),
+            np.empty(n, np.int32),
+            np.empty(n, np.float32),
+            np.empty(n, np.float32),
+        )
+        self._require_open()
+        intersect_packets(
+            self._functions["rtcIntersect16"],
+            self._scene,
+            origins,
+            directions,
+            t_max,
+            self._mesh_begin,
+            self._instance_mesh,
+            *hits,
+        )
+        return hits
+
+    def occluded(self, origins: F32, directions: F32, t_max: F32 | float | None = None) -> Bool:
+        """See `Tracer.occluded`."""
+        origins, directions, t_max = checked_rays(origins, directions, t_max)
+        blocked = np.empty(len(origins), np.bool_)
+        self._require_open()
+        occluded_packets(self._functions["rtcOccluded16"], self._scene, origins, directions, t_max, blocked)
+        return blocked
+
+    def _require_open(self) -> None:
+        if not self._scene:
+            raise ValueError("this tracer was closed")
