@@ -1,0 +1,184 @@
+"""Point instancers: many placements of a few prototypes, never copies of their triangles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Usd, UsdGeom
+
+from icheat_usd.scene import F64, I64
+from icheat_usd.stage.placing import GeometryBuilder, relative_matrix
+from icheat_usd.stage.walking import walk
+
+#: Instancers inside prototypes of instancers are followed this deep; a prototype may, by mistake, hold itself.
+DEEPEST = 8
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One mesh of a prototype."""
+
+    mesh: int
+    matrix: F64  #: (4, 4) row-vector, to the prototype's root
+    name: str  #: path relative to the prototype
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """One part of one prototype, everywhere its instancer puts it."""
+
+    mesh: int
+    matrices: F64  #: (k, 4, 4) row-vector, to the instancer's space
+    ids: I64  #: (k,)
+    part: str
+
+
+class InstancerReader:
+    """Places what point instancers show; prototypes are read once."""
+
+    def __init__(self, builder: GeometryBuilder) -> None:
+        self._builder = builder
+        self._report = builder.report
+        self._parts: dict[Sdf.Path, list[_Part]] = {}
+
+    def place(self, prim: Usd.Prim) -> None:
+        """Add every visible instance of an instancer that is itself shown.
+
+        Surfaces carry the instancer's path, the instance's id and, where the
+        prototype has several meshes, the mesh's path relative to the prototype.
+        """
+        to_world = np.array(self._builder.xforms.GetLocalToWorldTransform(prim))
+        path = str(prim.GetPath())
+        for placed in self._expand(prim, 0):
+            names = [(path, int(instance_id), placed.part) for instance_id in placed.ids]
+            self._builder.place(placed.mesh, placed.matrices @ to_world, names)
+
+    def _expand(self, prim: Usd.Prim, depth: int) -> list[_Placed]:
+        instancer = UsdGeom.PointInstancer(prim)
+        time = self._instance_time(instancer)
+        which = np.array(instancer.GetProtoIndicesAttr().Get(time) or (), dtype=np.int64)
+        if not len(which):
+            self._report(prim, "point instancer", "it has no protoIndices at this time; nothing is instanced.")
+            return []
+        matrices = self._matrices(instancer, time, len(which))
+        if matrices is None:
+            return []
+        self._report_per_instance_color(prim)
+        shown = self._mask(instancer, time, len(which))
+        ids = self._ids(instancer, time, len(which))
+        prototypes = [prim.GetStage().GetPrimAtPath(path) for path in instancer.GetPrototypesRel().GetForwardedTargets()]
+        if which.min() < 0 or which.max() >= len(prototypes):
+            self._report(
+                prim,
+                "protoIndices",
+                f"protoIndices reach outside its {len(prototypes)} prototypes; those instances are left out.",
+            )
+        result = []
+        for index, prototype in enumerate(prototypes):
+            chosen = np.flatnonzero((which == index) & shown)
+            if not len(chosen):
+                continue
+            if not prototype:
+                self._report(prim, "prototypes", f"prototype {index} does not exist; its instances are left out.")
+                continue
+            for part in self._prototype_parts(prototype, depth):
+                result.append(_Placed(part.mesh, part.matrix @ matrices[chosen], ids[chosen], part.name))
+        return result
+
+    def _instance_time(self, instancer: UsdGeom.PointInstancer) -> Usd.TimeCode:
+        """A true time for the instances: velocities are extrapolated to it, which no 'earliest' allows."""
+        time = self._builder.time
+        if time != Usd.TimeCode.EarliestTime():
+            return time
+        samples = instancer.GetPositionsAttr().GetTimeSamples() or instancer.GetProtoIndicesAttr().GetTimeSamples()
+        return Usd.TimeCode(samples[0]) if samples else Usd.TimeCode.Default()
+
+    def _matrices(self, instancer: UsdGeom.PointInstancer, time: Usd.TimeCode, n: int) -> F64 | None:
+        prim = instancer.GetPrim()
+        positions = instancer.GetPositionsAttr().Get(time)
+        if positions is None or len(positions) != n:
+            count = 0 if positions is None else len(positions)
+            self._report(prim, "point instancer", f"it has {n} protoIndices and {count} positions; left out.")
+            return None
+        matrices = instancer.ComputeInstanceTransformsAtTime(
+            time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+        )
+        if matrices is None or len(matrices) != n:
+            self._report(prim, "point instancer", "USD finds no transforms: check orientations and scales; left out.")
+            return None
+        return np.array(matrices, dtype=np.float64)
+
+    def _mask(self, instancer: UsdGeom.PointInstancer, time: Usd.TimeCode, n: int) -> NDArray[np.bool_]:
+        mask = instancer.ComputeMaskAtTime(time)
+        return np.array(mask, dtype=np.bool_) if len(mask) == n else np.ones(n, np.bool_)
+
+    def _ids(self, instancer: UsdGeom.PointInstancer, time: Usd.TimeCode, n: int) -> I64:
+        ids = np.array(instancer.GetIdsAttr().Get(time) or (), dtype=np.int64)
+        if not len(ids):
+            return np.arange(n)
+        if len(ids) != n or len(np.unique(ids)) != n:
+            self._report(
+                instancer.GetPrim(), "ids", f"ids are not {n} different numbers; instances are numbered in order instead."
+            )
+            return np.arange(n)
+        return ids
+
+    def _report_per_instance_color(self, prim: Usd.Prim) -> None:
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
+        if primvar and primvar.HasAuthoredValue() and str(primvar.GetInterpolation()) != "constant":
+            self._report(
+                prim, "primvar displayColor", "a colour per instance is not supported; the prototype's colour is used."
+            )
+
+    def _prototype_parts(self, root: Usd.Prim, depth: int) -> list[_Part]:
+        path = root.GetPath()
+        if path in self._parts:
+            return self._parts[path]
+        builder = self._builder
+        found = walk(root, self._report, prototypes=True)
+        for light in found.lights:
+            if light not in found.gprims:
+                self._report(light, "instanced light", "a light inside a point-instanced prototype is left out.")
+        gprims = [prim for prim in found.gprims if self._is_shown_within(prim, root)]
+        parts = [
+            _Part(mesh, relative_matrix(builder.xforms, prim, root), _relative_path(prim, root))
+            for prim, mesh in zip(gprims, builder.add_meshes(gprims), strict=True)
+            if mesh is not None
+        ]
+        for nested in found.instancers:
+            if not self._is_shown_within(nested, root):
+                continue
+            if depth + 1 >= DEEPEST:
+                self._report(nested, "nested point instancer", f"nested deeper than {DEEPEST}; left out.")
+                continue
+            base, matrix = _relative_path(nested, root), relative_matrix(builder.xforms, nested, root)
+            for placed in self._expand(nested, depth + 1):
+                below = f"/{placed.part}" if placed.part else ""
+                parts.extend(
+                    _Part(placed.mesh, placed.matrices[i] @ matrix, f"{base}[{placed.ids[i]}]{below}")
+                    for i in range(len(placed.ids))
+                )
+        if len(parts) == 1:
+            parts = [_Part(parts[0].mesh, parts[0].matrix, "")]
+        self._parts[path] = parts
+        return parts
+
+    def _is_shown_within(self, prim: Usd.Prim, root: Usd.Prim) -> bool:
+        """Shown as part of a prototype: what hides the prototype's ancestors does not hide its instances."""
+        if not self._builder.has_purpose(prim):
+            return False
+        step = prim
+        while step:
+            attribute = UsdGeom.Imageable(step).GetVisibilityAttr()
+            if attribute and attribute.Get(self._builder.time) == "invisible":
+                return False
+            if step == root:
+                return True
+            step = step.GetParent()
+        return True
+
+
+def _relative_path(prim: Usd.Prim, root: Usd.Prim) -> str:
+    return str(prim.GetPath().MakeRelativePath(root.GetPath()))

@@ -1,0 +1,143 @@
+"""A stage at one time code, turned into arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from icheat_usd.errors import StageError
+from icheat_usd.progress import Progress, silent
+from icheat_usd.scene import SceneSnapshot
+from icheat_usd.stage.camera import find_camera, frame_camera, read_camera, read_render_choices
+from icheat_usd.stage.instancing import InstancerReader
+from icheat_usd.stage.lights import read_lights, with_mesh_lights
+from icheat_usd.stage.materials import MaterialLibrary
+from icheat_usd.stage.opening import composition_findings, quiet_usd
+from icheat_usd.stage.placing import GeometryBuilder
+from icheat_usd.stage.reporting import Reporter
+from icheat_usd.stage.transforms import Placement
+from icheat_usd.stage.walking import walk
+
+#: Value of `camera` that frames all geometry instead of looking through a camera of the stage.
+AUTO_CAMERA = "auto"
+
+
+def take_snapshot(
+    stage: Usd.Stage,
+    *,
+    camera: str | None = None,
+    time: float | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    subdivision_level: int = 2,
+    purposes: Sequence[str] = ("default", "render"),
+    progress: Progress = silent,
+) -> SceneSnapshot:
+    """Read everything that is rendered from a stage at one time.
+
+    Parameters
+    ----------
+    stage
+        Not changed.
+    camera
+        Path of a camera; by default that of the render settings, else the stage's only one.
+        ``"auto"`` makes one that frames all geometry.
+    time
+        Time code; by default the stage's start time code where it has one, else the earliest sample of each value.
+    width, height : pixels
+        By default as the render settings say, else 640 wide with the camera's aspect.
+    subdivision_level
+        Steps of subdivision surfaces.
+    purposes
+        Purposes that are shown.
+    progress
+        Told how far the reading is.
+
+    Returns
+    -------
+    SceneSnapshot
+        In metres about the scene's centre, stage axes kept; its `findings` list what could not be read.
+
+    Raises
+    ------
+    StageError
+        No camera can be chosen, or the chosen one cannot be used.
+    """
+    if subdivision_level < 0:
+        raise StageError(f"The subdivision level is {subdivision_level}; give 0 or more.")
+    code = time if time is not None else _start_time(stage)
+    when = Usd.TimeCode.EarliestTime() if code is None else Usd.TimeCode(code)
+    report = Reporter()
+    with quiet_usd():
+        choices = read_render_choices(stage, when)
+        camera_prim = None if camera == AUTO_CAMERA else find_camera(stage, None if camera is None else str(camera), choices)
+        report.extend(composition_findings(stage))
+
+        progress("reading the stage", 0.0)
+        found = walk(stage.GetPseudoRoot(), report)
+        materials = MaterialLibrary(stage, when)
+        builder = GeometryBuilder(when, materials, subdivision_level, purposes, choices.material_purpose, report)
+        gprims = [prim for prim in found.gprims if builder.is_shown(prim)]
+        progress("reading the stage", 0.2)
+        for prim, mesh in zip(gprims, builder.add_meshes(gprims), strict=True):
+            if mesh is not None:
+                builder.place_prim(prim, mesh)
+        progress("reading the stage", 0.6)
+        instancers = InstancerReader(builder)
+        for prim in found.instancers:
+            if builder.is_shown(prim):
+                instancers.place(prim)
+
+        meters_per_unit = _meters_per_unit(stage, report)
+        bounds = builder.bounds()
+        middle = np.zeros(3) if bounds is None else 0.5 * (bounds[0] + bounds[1])
+        placement = Placement(meters_per_unit, middle * meters_per_unit, when)
+        if bounds is None:
+            report("/", "geometry", "the stage shows no geometry at this time; check visibility, purpose and payloads.")
+        geometry = builder.build(placement)
+
+        progress("reading the stage", 0.8)
+        lights_shown = [prim for prim in found.lights if builder.is_shown(prim)]
+        lights, light_paths, light_findings = read_lights(lights_shown, when, placement, materials.textures)
+        tables, material_paths = materials.tables()
+        lights, light_paths = with_mesh_lights(
+            lights, light_paths, geometry, builder.surfaces, tables, material_paths
+        )
+        report.extend(materials.findings)
+        report.extend(light_findings)
+
+        if camera_prim is None:
+            half = np.zeros(3) if bounds is None else 0.5 * (bounds[1] - bounds[0]) * meters_per_unit
+            view = frame_camera(-half, half, str(UsdGeom.GetStageUpAxis(stage)), width, height, choices)
+        else:
+            view = read_camera(camera_prim, when, placement, choices, width, height)
+        progress("reading the stage", 1.0)
+        return SceneSnapshot(
+            geometry=geometry,
+            surfaces=tuple(builder.surfaces),
+            materials=tables,
+            material_paths=material_paths,
+            textures=materials.textures.table(),
+            lights=lights,
+            light_paths=light_paths,
+            camera=view,
+            stage_path=stage.GetRootLayer().realPath or stage.GetRootLayer().identifier,
+            time_code=code,
+            centre=placement.centre,
+            radius=builder.radius(placement),
+            findings=report.findings(),
+        )
+
+
+def _start_time(stage: Usd.Stage) -> float | None:
+    return float(stage.GetStartTimeCode()) if stage.HasAuthoredMetadata("startTimeCode") else None
+
+
+def _meters_per_unit(stage: Usd.Stage, report: Reporter) -> float:
+    value = float(UsdGeom.GetStageMetersPerUnit(stage))
+    if np.isfinite(value) and value > 0.0:
+        return value
+    report("/", "metersPerUnit", f"metersPerUnit is {value}; 0.01, USD's own fallback, is used.")
+    return 0.01
