@@ -121,8 +121,7 @@ def read_keys(prim: Usd.Prim) -> KeyTrack | None:
         )
     if opinion.source == "default":
         digest = opinion.layer.GetAttributeAtPath(opinion.path).default
-        keys = (_key(prim, None, str(digest), file_opinion, None),)
-        return KeyTrack(keys, held, identifier)
+        return KeyTrack((_key(prim, None, str(digest), file_opinion, None),), held, identifier)
     keys = []
     for layer_time in opinion.layer.ListTimeSamplesForPath(opinion.path):
         value = opinion.layer.QueryTimeSample(opinion.path, layer_time)

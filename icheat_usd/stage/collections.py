@@ -1,0 +1,70 @@
+"""Which surfaces a collection of an edit includes."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+from pxr import Sdf, Usd
+
+from icheat_usd.edits.model import Selection
+from icheat_usd.errors import EditError
+
+
+def collection(edit: Usd.Prim, name: str) -> Usd.CollectionAPI:
+    """The collection of an edit, usable for queries whether or not the schemas are registered.
+
+    Where they are not, `includeRoot` has no value unless authored; USD takes that for false, which is our fallback.
+    """
+    return Usd.CollectionAPI(edit, name)
+
+
+def select(edit: Usd.Prim, name: str, surface_paths: Iterable[str]) -> Selection:
+    """The surfaces among `surface_paths` (scene paths) that the collection includes.
+
+    A prim that is included takes its descendants along, instance proxies too, unless the collection's expansion
+    rule says otherwise. Membership expressions are matched by USD, which knows only paths that the stage has.
+    """
+    query = collection(edit, name).ComputeMembershipQuery()
+    return Selection(frozenset(path for path in set(surface_paths) if query.IsPathIncluded(Sdf.Path(path))))
+
+
+def authored(edit: Usd.Prim, name: str) -> tuple[tuple[str, ...], tuple[str, ...], str]:
+    """Includes, excludes and membership expression ("" where none) of a collection, as composed."""
+    api = collection(edit, name)
+    includes, excludes = (
+        tuple(str(path) for path in rel.GetTargets()) if rel else ()
+        for rel in (api.GetIncludesRel(), api.GetExcludesRel())
+    )
+    attribute = api.GetMembershipExpressionAttr()
+    expression = attribute.Get() if attribute else None
+    return includes, excludes, str(expression.GetText()) if expression else ""
+
+
+def find_prims(stage: Usd.Stage, names: Iterable[str], what: str) -> tuple[Sdf.Path, ...]:
+    """Paths of prims or collections that a person named: absolute, or relative to the default prim.
+
+    Raises
+    ------
+    EditError
+        A name matches nothing on the stage; the message suggests close paths.
+    """
+    return tuple(_find(stage, name, what) for name in names)
+
+
+def _find(stage: Usd.Stage, name: str, what: str) -> Sdf.Path:
+    if not Sdf.Path.IsValidPathString(name):
+        raise EditError(f"{what}: '{name}' is not a prim path; give one such as /World/Room/floor")
+    path = Sdf.Path(name)
+    default = stage.GetDefaultPrim()
+    if not path.IsAbsolutePath():
+        path = path.MakeAbsolutePath(default.GetPath() if default else Sdf.Path.absoluteRootPath)
+    if path == Sdf.Path.absoluteRootPath:
+        return path
+    if stage.GetPrimAtPath(path.GetPrimPath()) and (path.IsPrimPath() or Usd.CollectionAPI.Get(stage, path)):
+        return path
+    known = [str(prim.GetPath()) for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())]
+    close = [p for p in known if p.rpartition("/")[2] == path.name][:3]
+    close = close or difflib.get_close_matches(str(path), known, n=3)
+    hint = f"; did you mean {' or '.join(close)}?" if close else "; `usdtree` lists what there is"
+    raise EditError(f"{what}: the stage {stage.GetRootLayer().identifier} has no prim {path}{hint}")
