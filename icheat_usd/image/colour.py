@@ -111,7 +111,7 @@ def to_display(
     if dither:
         y, x = np.indices(encoded.shape[:2], dtype=np.float64)
         noise = (52.9829189 * ((0.06711056 * x + 0.00583715 * y) % 1.0)) % 1.0
-        threshold = noise[..., None].astype(np.float32)
+        threshold = np.expand_dims(np.asarray(noise, dtype=np.float32), -1)
     return np.floor(np.clip(encoded, 0.0, 1.0) * np.float32(255.0) + threshold).clip(0, 255).astype(np.uint8)
 
 

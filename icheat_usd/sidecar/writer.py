@@ -1,0 +1,293 @@
+"""Writing sidecar files once: complete and flushed before they get a name, never changed afterwards."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import socket
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from icheat_usd import __version__
+from icheat_usd.edits.model import Payload
+from icheat_usd.errors import SidecarError
+from icheat_usd.sidecar.canonical import Array, Element, digest_of
+from icheat_usd.sidecar.elements import encode_payload
+from icheat_usd.sidecar.reader import (
+    FORMAT,
+    FORMAT_VERSION,
+    MAX_PAYLOAD_BYTES,
+    History,
+    list_payloads,
+    open_sidecar,
+    read_elements,
+    read_history,
+)
+
+SUFFIX = ".icheat.h5"
+
+# Large enough for gzip to find repeats, small enough to read a part; SPEC.md allows up to 64 MiB.
+_CHUNK_BYTES = 1 << 20
+_FILTER_FROM_BYTES = 1 << 12
+_ABANDONED_AFTER_SECONDS = 24 * 3600.0
+
+
+def write_payloads(
+    beside: str | os.PathLike[str],
+    payloads: Iterable[Payload],
+    *,
+    anchor: str,
+    history: History | None = None,
+) -> tuple[Path, list[str]]:
+    """Write payloads into one new file beside a layer.
+
+    Parameters
+    ----------
+    beside : path
+        The layer that will name the file (`shot.usda` gets
+        ``shot.v001.icheat.h5``, then ``.v002`` ...); or a folder; or, ending
+        in ``.icheat.h5``, the very file to make, which must not exist.
+    payloads : iterable of Payload
+        Equal ones are stored once.
+    anchor : str
+        Absolute prim path above every surface that a mask names; the file
+        holds paths relative to it.
+    history : History, optional
+        Who and why. Nothing else of the moment is stored: the same payloads
+        give the same bytes.
+
+    Returns
+    -------
+    (Path, list of str)
+        The file, and the digest of each payload in the order given: the
+        values of `icheat:filePath` and `icheat:payload`.
+
+    Raises
+    ------
+    SidecarError
+        There is nothing to write, a payload cannot be stored, the file
+        exists, or the folder is missing, full or not writable. Nothing is
+        left behind then, nor after an interruption.
+    """
+    encoded = [encode_payload(payload, anchor=anchor) for payload in payloads]
+    if not encoded:
+        raise SidecarError(f"{os.fspath(beside)}: there are no payloads to write; give at least one")
+    digests = [digest_of(elements) for elements in encoded]
+    contents = dict(zip(digests, encoded, strict=True))
+    entries = [History(history.who, history.why, history.when, tuple(dict.fromkeys(digests)))] if history else []
+    return _publish(Path(beside), lambda root: _fill(root, contents, entries)), digests
+
+
+def pack(files: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str]) -> tuple[Path, list[str]]:
+    """Merge the payloads of several files into one new file, elements of unknown types included.
+
+    Parameters
+    ----------
+    files : sequence of path
+        Read and verified; left as they are.
+    out : path
+        As `beside` of `write_payloads`.
+
+    Returns
+    -------
+    (Path, list of str)
+        The new file and the digests in it, sorted.
+
+    Raises
+    ------
+    SidecarError
+        As `read_payload` for what is read and `write_payloads` for what is written.
+    """
+    digests: dict[str, str] = {}
+    entries: list[History] = []
+    for file in files:
+        for digest in list_payloads(file):
+            digests.setdefault(digest, os.fspath(file))
+        entries.extend(entry for entry in read_history(file) if entry not in entries)
+    if not digests:
+        raise SidecarError(f"{os.fspath(out)}: there are no payloads to pack; name files that hold some")
+
+    def fill(root: h5py.Group) -> None:
+        _fill(root, {}, entries)
+        # One payload in memory at a time.
+        for digest, file in sorted(digests.items()):
+            with open_sidecar(file, file) as source:
+                elements = read_elements(source, digest, file, MAX_PAYLOAD_BYTES)
+            _write_payload(root["payloads"], digest, elements)
+
+    return _publish(Path(out), fill), sorted(digests)
+
+
+# Contents -------------------------------------------------------------------------------------------------------------
+
+
+def _fill(root: h5py.Group, contents: Mapping[str, Mapping[str, Element]], entries: Sequence[History]) -> None:
+    root.attrs["format"] = _fixed(FORMAT)
+    root.attrs["format-version"] = np.int64(FORMAT_VERSION)
+    root.attrs["creator"] = _fixed(f"icheat_usd {__version__}")
+    group = root.create_group("payloads")
+    for digest in sorted(contents):
+        _write_payload(group, digest, contents[digest])
+    history = root.create_group("history")
+    for number, entry in enumerate(entries):
+        place = history.create_group(f"{number:06d}")
+        for key in ("who", "why", "when"):
+            _write_dataset(place, key, np.asarray(_fixed(getattr(entry, key))))
+        _write_dataset(place, "payloads", np.array([digest.encode() for digest in entry.payloads], dtype="S64"))
+
+
+def _write_payload(group: h5py.Group, digest: str, elements: Mapping[str, Element]) -> None:
+    payload = group.create_group(digest)
+    for name, element in sorted(elements.items(), key=lambda item: item[0].encode()):
+        place = payload.create_group(name)
+        place.attrs["element-type"] = _fixed(element.type)
+        place.attrs["element-version"] = np.int64(element.version)
+        for path, array in sorted(element.datasets.items(), key=lambda item: item[0].encode()):
+            _write_dataset(place, path, array)
+
+
+def _write_dataset(group: h5py.Group, path: str, array: Array) -> None:
+    if array.dtype.kind == "S":
+        # HDF5 converts no ASCII to UTF-8 strings: the array itself has to say that it is UTF-8.
+        array = array.astype(h5py.string_dtype("utf-8", max(1, array.dtype.itemsize)))
+    options: dict[str, Any] = {}
+    if array.nbytes >= _FILTER_FROM_BYTES:
+        options = {"chunks": _chunks(array), "compression": "gzip", "compression_opts": 1}
+        options |= {"shuffle": True, "fletcher32": True}
+    group.create_dataset(path, data=np.ascontiguousarray(array) if array.ndim else array, **options)
+
+
+def _chunks(array: Array) -> tuple[int, ...]:
+    """Whole rows, as many as fit; where one row is too large, it is split along the following axes."""
+    room, chunks = max(1, _CHUNK_BYTES // array.dtype.itemsize), []
+    for size in reversed(array.shape):
+        step = max(1, min(size, room))
+        chunks.append(step)
+        room = max(1, room // step)
+    return tuple(reversed(chunks))
+
+
+def _fixed(value: str) -> Any:
+    encoded = value.replace("\0", "").encode("utf-8", "replace")
+    return np.array(encoded, dtype=h5py.string_dtype("utf-8", max(1, len(encoded))))[()]
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def _publish(beside: Path, fill: Callable[[h5py.Group], None]) -> Path:
+    """Make a file complete under a temporary name, then give it a name that no file has."""
+    exact = beside.name.endswith(SUFFIX)
+    folder = beside if beside.is_dir() else beside.parent
+    stem = beside.name[: -len(SUFFIX)] if exact else ("edits" if beside.is_dir() else beside.stem)
+    if not folder.is_dir():
+        raise SidecarError(f"{beside}: there is no folder '{folder}'; make it first")
+    if exact and beside.exists():
+        raise SidecarError(f"{beside}: exists, and sidecars are never overwritten; choose an unused name")
+    _remove_abandoned(folder, stem)
+    temporary = folder / f".{stem}.{socket.gethostname()}.{os.getpid()}.{secrets.token_hex(4)}.icheat-tmp"
+    try:
+        # Created by name with the usual mode, not by mkstemp, so that the umask decides who may read the file.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        # v108 to v110: every HDF5 since 1.10 reads it, and object headers carry no times.
+        with h5py.File(temporary, "w", libver=("v108", "v110"), locking=False) as root:
+            fill(root)
+        _flush(temporary)
+        if exact:
+            if not _give_name(temporary, beside):
+                raise SidecarError(f"{beside}: exists, and sidecars are never overwritten; choose an unused name")
+            final = beside
+        else:
+            final = _give_unused_name(temporary, folder, stem)
+        _flush(folder)
+        return final
+    except SidecarError:
+        raise
+    except (OSError, RuntimeError, ValueError) as problem:
+        reason = getattr(problem, "strerror", None) or str(problem).splitlines()[0]
+        raise SidecarError(
+            f"{beside}: cannot write a sidecar in '{folder}' ({reason}); free space, change permissions or choose "
+            "another place"
+        ) from problem
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def _give_unused_name(temporary: Path, folder: Path, stem: str) -> Path:
+    pattern = re.compile(re.escape(stem) + r"\.v(\d+)" + re.escape(SUFFIX))
+    taken = [int(match[1]) for name in os.listdir(folder) if (match := pattern.fullmatch(name))]
+    version = max(taken, default=0) + 1
+    while True:
+        final = folder / f"{stem}.v{version:03d}{SUFFIX}"
+        if _give_name(temporary, final):
+            return final
+        version += 1  # another writer was faster
+
+
+def _give_name(temporary: Path, final: Path) -> bool:
+    """Name a finished file; False where the name is taken. It never shows an incomplete file under that name."""
+    try:
+        os.link(temporary, final)
+        return True
+    except FileExistsError:
+        return False
+    except OSError:
+        pass  # no hard links on this file system
+    # Claim the name with an empty file, then put the finished one in its place: both steps are atomic. A crash in
+    # between leaves the empty file, which no layer names yet.
+    try:
+        os.close(os.open(final, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except FileExistsError:
+        return False
+    try:
+        os.replace(temporary, final)
+    except BaseException:
+        with suppress(OSError):
+            final.unlink()
+        raise
+    return True
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        # Some file systems cannot flush a folder; the file itself must be on the disk.
+        if not path.is_dir():
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _remove_abandoned(folder: Path, stem: str) -> None:
+    """Remove temporary files of writers that were killed: dead on this machine, or a day old on another."""
+    pattern = re.compile(rf"\.{re.escape(stem)}\.(.+)\.(\d+)\.[0-9a-f]{{8}}\.icheat-tmp")
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            if (match := pattern.fullmatch(name)) is None:
+                continue
+            if match[1] == socket.gethostname():
+                abandoned = not _is_running(int(match[2]))
+            else:
+                abandoned = time.time() - (folder / name).stat().st_mtime > _ABANDONED_AFTER_SECONDS
+            if abandoned:
+                (folder / name).unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
