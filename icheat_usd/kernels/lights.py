@@ -20,6 +20,7 @@ from icheat_usd.kernels.environment import (
     Array,
     Floats,
     Table,
+    dome_image_pdf,
     dome_lookup,
     image_bilinear,
     sample_dome_image,
@@ -187,45 +188,66 @@ def _rect_radiance(lights: Table, textures: Table, light: int, x: float, y: floa
 
 
 @kernel
-def _sample_rect(
-    lights: Table, textures: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
-) -> Floats:
+def _rect_frame(lights: Table, light: int, px: float, py: float, pz: float) -> Floats:
+    """Edge lengths, corner (x0, y0) and depth of a rect seen from a point, constants of Urena, its solid angle.
+
+    Depth 0: the point is behind or the rect has no area. Solid angle 0: to be sampled by area.
+    """
     m = lights.to_world[light]
     ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
     width = float(lights.size[light, 0])
     height = float(lights.size[light, 1])
-    area = scale * width * height
-    if area == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    # receiver relative to the centre; depth along the emitting side's normal
     qx, qy, qz = m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz
     depth = -_dot(qx, qy, qz, nx, ny, nz)
-    if depth <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if scale * width * height == 0.0 or depth <= 0.0:
+        return 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     la = math.sqrt(_dot(ax, ay, az, ax, ay, az))
     lb = math.sqrt(_dot(bx, by, bz, bx, by, bz))
+    ex = la * width
+    ey = lb * height
+    x0 = _dot(qx, qy, qz, ax, ay, az) / la - 0.5 * ex
+    y0 = _dot(qx, qy, qz, bx, by, bz) / lb - 0.5 * ey
+    square = abs(_dot(ax, ay, az, bx, by, bz)) < 1e-6 * la * lb
+    if not square or depth < 1e-6 * (ex + ey):
+        return ex, ey, x0, y0, depth, 0.0, 0.0, 0.0, 0.0
+    b0, b1, k, solid_angle = _spherical_rectangle(ex, ey, x0, y0, -depth)
+    if solid_angle < _SMALLEST_SPHERICAL_RECTANGLE:
+        solid_angle = 0.0
+    return ex, ey, x0, y0, depth, b0, b1, k, solid_angle
+
+
+@kernel
+def _sample_rect(
+    lights: Table, textures: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+) -> Floats:
+    ex, ey, x0, y0, depth, b0, b1, k, solid_angle = _rect_frame(lights, light, px, py, pz)
+    if depth <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     x = u1
     y = u2
-    pdf = 0.0
-    if abs(_dot(ax, ay, az, bx, by, bz)) < 1e-6 * la * lb and depth > 1e-6 * (la * width + lb * height):
-        ex = la * width
-        ey = lb * height
-        x0 = _dot(qx, qy, qz, ax, ay, az) / la - 0.5 * ex
-        y0 = _dot(qx, qy, qz, bx, by, bz) / lb - 0.5 * ey
-        b0, b1, k, solid_angle = _spherical_rectangle(ex, ey, x0, y0, -depth)
-        if solid_angle > _SMALLEST_SPHERICAL_RECTANGLE:
-            xu, yv = _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, -depth, x0 + ex, y0 + ey, u1, u2)
-            x = (xu - x0) / ex
-            y = (yv - y0) / ey
-            pdf = 1.0 / solid_angle
-    sx = (x - 0.5) * width
-    sy = (y - 0.5) * height
-    dx, dy, dz = qx + ax * sx + bx * sy, qy + ay * sx + by * sy, qz + az * sx + bz * sy
+    if solid_angle > 0.0:
+        xu, yv = _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, -depth, x0 + ex, y0 + ey, u1, u2)
+        x = (xu - x0) / ex
+        y = (yv - y0) / ey
+    m = lights.to_world[light]
+    sx = (x - 0.5) * lights.size[light, 0]
+    sy = (y - 0.5) * lights.size[light, 1]
+    dx = m[0, 3] - px + m[0, 0] * sx + m[0, 1] * sy
+    dy = m[1, 3] - py + m[1, 0] * sx + m[1, 1] * sy
+    dz = m[2, 3] - pz + m[2, 0] * sx + m[2, 1] * sy
     distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
-    if pdf == 0.0:
-        pdf = _to_solid_angle(1.0 / area, distance, depth / distance)
+    pdf = 1.0 / solid_angle if solid_angle > 0.0 else _plane_pdf(lights, light, distance, depth / distance)
     r, g, b = _rect_radiance(lights, textures, light, x, y)
     return dx / distance, dy / distance, dz / distance, distance, pdf, r, g, b
+
+
+@kernel
+def _plane_pdf(lights: Table, light: int, distance: float, cosine: float) -> float:
+    """Probability per solid angle of uniform samples of the area of a rect or disk."""
+    scale = _plane_axes(lights.to_world[light])[9]
+    a = float(lights.size[light, 0])
+    area = scale * (a * lights.size[light, 1] if lights.kind[light] == _RECT else math.pi * a * a)
+    return _to_solid_angle(1.0 / area, distance, cosine)
 
 
 @kernel
@@ -243,7 +265,7 @@ def _sample_disk(lights: Table, light: int, px: float, py: float, pz: float, u1:
     y *= radius
     dx, dy, dz = qx + ax * x + bx * y, qy + ay * x + by * y, qz + az * x + bz * y
     distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
-    pdf = _to_solid_angle(1.0 / area, distance, depth / distance)
+    pdf = _plane_pdf(lights, light, distance, depth / distance)
     return dx / distance, dy / distance, dz / distance, distance, pdf, 1.0, 1.0, 1.0
 
 
@@ -468,3 +490,188 @@ def sample_mesh(
     if cosine < 1e-9:
         return row, b1, b2, lx, ly, lz, nx, ny, nz, 0.0
     return row, b1, b2, lx, ly, lz, nx, ny, nz, _to_solid_angle(2.0 * probability / double_area, distance, cosine)
+
+
+# Where rays meet lights ---------------------------------------------------------------------------
+# Each answers (distance, probability per solid angle with which the sampler above returns this
+# direction, radiance relative to `lights.radiance`); probability 0 where the ray misses.
+
+
+@kernel
+def _hit_plane(
+    lights: Table, textures: Table, light: int, px: float, py: float, pz: float, wx: float, wy: float, wz: float
+) -> Floats:
+    m = lights.to_world[light]
+    ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
+    cosine = -_dot(wx, wy, wz, nx, ny, nz)
+    qx, qy, qz = m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz
+    depth = -_dot(qx, qy, qz, nx, ny, nz)
+    if scale == 0.0 or cosine <= 0.0 or depth <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    t = depth / cosine
+    hx, hy, hz = t * wx - qx, t * wy - qy, t * wz - qz
+    aa = _dot(ax, ay, az, ax, ay, az)
+    ab = _dot(ax, ay, az, bx, by, bz)
+    bb = _dot(bx, by, bz, bx, by, bz)
+    ha = _dot(hx, hy, hz, ax, ay, az)
+    hb = _dot(hx, hy, hz, bx, by, bz)
+    x = (ha * bb - hb * ab) / (scale * scale)
+    y = (hb * aa - ha * ab) / (scale * scale)
+    width = float(lights.size[light, 0])
+    if lights.kind[light] == _DISK:
+        if x * x + y * y > width * width:
+            return 0.0, 0.0, 0.0, 0.0, 0.0
+        return t, _plane_pdf(lights, light, t, cosine), 1.0, 1.0, 1.0
+    height = float(lights.size[light, 1])
+    if abs(x) > 0.5 * width or abs(y) > 0.5 * height:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    solid_angle = _rect_frame(lights, light, px, py, pz)[8]
+    pdf = 1.0 / solid_angle if solid_angle > 0.0 else _plane_pdf(lights, light, t, cosine)
+    r, g, b = _rect_radiance(lights, textures, light, x / width + 0.5, y / height + 0.5)
+    return t, pdf, r, g, b
+
+
+@kernel
+def _hit_sphere(
+    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, wx: float, wy: float, wz: float
+) -> Floats:
+    m = lights.to_world[light]
+    radius = float(lights.size[light, 0])
+    determinant = tables.determinant[light]
+    if radius <= 0.0 or determinant == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    qx, qy, qz = _linear(tables.to_local[light], m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz)
+    qx, qy, qz = qx / radius, qy / radius, qz / radius
+    dx, dy, dz = _linear(tables.to_local[light], wx, wy, wz)
+    length = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
+    dx, dy, dz = dx / length, dy / length, dz / length
+    d2 = _dot(qx, qy, qz, qx, qy, qz)
+    along = _dot(qx, qy, qz, dx, dy, dz)
+    if d2 <= 1.0 or along <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    # distance of the centre from the ray, by the cross product: d2 - along^2 would cancel from afar
+    cx, cy, cz = _cross(qx, qy, qz, dx, dy, dz)
+    inside = 1.0 - _dot(cx, cy, cz, cx, cy, cz)
+    if inside < 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    t = (along - math.sqrt(inside)) * radius / length
+    one_minus_cos = (1.0 / d2) / (1.0 + math.sqrt(1.0 - 1.0 / d2))
+    pdf = _direction_scale(m, determinant, dx, dy, dz) / (2.0 * math.pi * one_minus_cos)
+    return t, pdf, 1.0, 1.0, 1.0
+
+
+@kernel
+def _hit_cylinder(
+    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, wx: float, wy: float, wz: float
+) -> Floats:
+    m = lights.to_world[light]
+    radius = float(lights.size[light, 0])
+    length = float(lights.size[light, 1])
+    if radius <= 0.0 or length <= 0.0 or tables.determinant[light] == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    lx, ly, lz = _linear(tables.to_local[light], px - m[0, 3], py - m[1, 3], pz - m[2, 3])
+    dx, dy, dz = _linear(tables.to_local[light], wx, wy, wz)
+    rho = math.sqrt(ly * ly + lz * lz)
+    a = dy * dy + dz * dz
+    b = -(ly * dy + lz * dz)
+    if rho <= radius or a == 0.0 or b <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    offset = ly * dz - lz * dy
+    root = a * radius * radius - offset * offset
+    if root < 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    t = (b - math.sqrt(root)) / a
+    if t <= 0.0 or abs(lx + t * dx) > 0.5 * length:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    y = ly + t * dy
+    z = lz + t * dz
+    # tangents along the axis and around it (per radian)
+    bx, by, bz = _linear(m, 0.0, -z, y)
+    nx, ny, nz = _cross(m[0, 0] * 1.0, m[1, 0] * 1.0, m[2, 0] * 1.0, bx, by, bz)
+    jacobian = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
+    cosine = abs(_dot(nx, ny, nz, wx, wy, wz)) / jacobian
+    if cosine < 1e-9:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    half = math.acos(radius / rho)
+    return t, _to_solid_angle(1.0 / (2.0 * half * length * jacobian), t, cosine), 1.0, 1.0, 1.0
+
+
+@kernel
+def _hit_distant(lights: Table, light: int, wx: float, wy: float, wz: float) -> Floats:
+    m = lights.to_world[light]
+    zx, zy, zz = _normalized(m[0, 2] * 1.0, m[1, 2] * 1.0, m[2, 2] * 1.0)
+    half_sine = math.sin(0.5 * lights.size[light, 0])
+    chord2 = (wx - zx) * (wx - zx) + (wy - zy) * (wy - zy) + (wz - zz) * (wz - zz)
+    if half_sine <= 0.0 or chord2 > 4.0 * half_sine * half_sine:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    return _FAR, 1.0 / (4.0 * math.pi * half_sine * half_sine), 1.0, 1.0, 1.0
+
+
+@kernel
+def _hit_dome(
+    lights: Table, textures: Table, tables: Table, light: int,
+    nx: float, ny: float, nz: float, wx: float, wy: float, wz: float,
+) -> Floats:  # fmt: skip
+    texture = lights.texture[light]
+    if texture < 0:
+        return _FAR, max(0.0, _dot(nx, ny, nz, wx, wy, wz)) / math.pi, 1.0, 1.0, 1.0
+    if tables.determinant[light] == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    x, y, z = _linear(tables.to_local[light], wx, wy, wz)
+    x, y, z = _normalized(x, y, z)
+    pdf = dome_image_pdf(
+        tables.rows_cdf,
+        tables.rows_begin[light],
+        tables.columns_cdf,
+        tables.columns_begin[light],
+        textures.width[texture],
+        textures.height[texture],
+        x,
+        y,
+        z,
+    )
+    r, g, b = dome_lookup(textures, texture, x, y, z)
+    pdf *= _direction_scale(lights.to_world[light], tables.determinant[light], x, y, z)
+    return _FAR, pdf, r, g, b
+
+
+@kernel
+def hit_analytic(
+    lights: Table, textures: Table, tables: Table, light: int, px: float, py: float, pz: float,
+    nx: float, ny: float, nz: float, wx: float, wy: float, wz: float,
+) -> Floats:  # fmt: skip
+    """Where a ray from a point meets a light that is no mesh, as `sample_analytic` would have sampled it."""
+    kind = lights.kind[light]
+    if kind == _SPHERE:
+        return _hit_sphere(lights, tables, light, px, py, pz, wx, wy, wz)
+    if kind == _DISK or kind == _RECT:
+        return _hit_plane(lights, textures, light, px, py, pz, wx, wy, wz)
+    if kind == _CYLINDER:
+        return _hit_cylinder(lights, tables, light, px, py, pz, wx, wy, wz)
+    if kind == _DISTANT:
+        return _hit_distant(lights, light, wx, wy, wz)
+    return _hit_dome(lights, textures, tables, light, nx, ny, nz, wx, wy, wz)
+
+
+@kernel
+def mesh_pdf(
+    lights: Table, tables: Table, light: int, row: int, px: float, py: float, pz: float,
+    hx: float, hy: float, hz: float,
+) -> float:  # fmt: skip
+    """Probability per solid angle with which `sample_mesh` picks the point (hx, hy, hz) of an emissive triangle."""
+    probability = tables.triangle_cdf[row] - (
+        tables.triangle_cdf[row - 1] if row > lights.triangle_begin[light] else 0.0
+    )
+    p = tables.triangle_corners[row]
+    nx, ny, nz = _cross(
+        p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2], p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
+    )
+    double_area = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
+    dx, dy, dz = hx - px, hy - py, hz - pz
+    distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
+    if double_area == 0.0 or distance == 0.0:
+        return 0.0
+    cosine = abs(_dot(dx, dy, dz, nx, ny, nz)) / (distance * double_area)
+    if cosine < 1e-9:
+        return 0.0
+    return _to_solid_angle(2.0 * probability / double_area, distance, cosine)

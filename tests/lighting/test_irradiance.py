@@ -12,6 +12,7 @@ from icheat_usd.scene import LightKind, SceneSnapshot, SurfacePoints, Texture
 from icheat_usd.tracing import build_tracer
 from tests.lighting import naive
 from tests.scenes import (
+    IDENTITY,
     Image,
     Light,
     Material,
@@ -179,7 +180,7 @@ def test_dome_image_that_is_black_gives_nothing() -> None:
     assert one(Light(LightKind.DOME, 1.0, image=Image(np.zeros((4, 8, 3))))) == 0.0
 
 
-def lamp(emission: ArrayLike, *, transform: ArrayLike = np.eye(4), textures: dict | None = None) -> Mesh:
+def lamp(emission: ArrayLike, *, transform: ArrayLike = IDENTITY, textures: dict | None = None) -> Mesh:
     points = quads([[(-0.5, -0.35, 0), (-0.5, 0.35, 0), (0.5, 0.35, 0), (0.5, -0.35, 0)]])
     st = quads([[(0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)]])[..., :2]
     return Mesh(points, Material(0.0, emission, textures=textures or {}), transforms=[transform], st=st)
