@@ -33,6 +33,7 @@ class EditFinding(Finding):
     """Something about an edit or a stack that its author should know."""
 
     severity: Severity = Severity.WARNING
+    rule: str = ""  #: class in `icheat_usd.stage.check` that found it, "" where reading did
 
 
 class PayloadReader(Protocol):
