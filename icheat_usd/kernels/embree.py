@@ -7,7 +7,7 @@ loaded elsewhere next time. Struct layouts are those of Embree 4's ``rtcore_ray.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from llvmlite import ir
@@ -20,7 +20,7 @@ CHUNK = 1024  # rays per buffer: enough to hide its allocation, few enough to ba
 _INVALID = np.uint32(0xFFFFFFFF)
 
 
-@intrinsic
+@cast(Any, intrinsic)  # as a caller sees it: without the typing context
 def _call_1(typingctx: Any, function: Any, scene: Any, ray: Any) -> Any:
     """``function(scene, ray, NULL)``: rtcIntersect1, rtcOccluded1."""
 
@@ -34,7 +34,7 @@ def _call_1(typingctx: Any, function: Any, scene: Any, ray: Any) -> Any:
     return types.void(types.int64, types.int64, types.int64), codegen
 
 
-@intrinsic
+@cast(Any, intrinsic)  # as a caller sees it: without the typing context
 def _call_packet(typingctx: Any, function: Any, valid: Any, scene: Any, rays: Any) -> Any:
     """``function(valid, scene, rays, NULL)``: rtcIntersect16, rtcOccluded16."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,18 +25,24 @@ def empty_points(n: int) -> SurfacePoints:
         "opacity": (np.float32, ()),
         "ior": (np.float32, ()),
     }
-    columns = (shapes.get(name, (np.float32, (3,))) for name in SurfacePoints._fields)
-    return SurfacePoints(*(np.empty((n, *tail), kind) for kind, tail in columns))
+    columns: list[Any] = []
+    for name in SurfacePoints._fields:
+        kind, tail = shapes.get(name, (np.float32, (3,)))
+        columns.append(np.empty((n, *tail), kind))
+    return SurfacePoints(*columns)
 
 
 def take_points(points: SurfacePoints, rows: ArrayLike) -> SurfacePoints:
     """Points `rows` (indices, mask or slice) as contiguous copies."""
-    return SurfacePoints(*(np.ascontiguousarray(column[rows]).copy() for column in points))  # type: ignore[index]
+    index: Any = rows
+    columns: list[Any] = [np.array(column[index], order="C") for column in points]
+    return SurfacePoints(*columns)
 
 
 def concatenate_points(*parts: SurfacePoints) -> SurfacePoints:
     """Points of all parts, one after another."""
-    return SurfacePoints(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return SurfacePoints(*columns)
 
 
 def shade_hits(snapshot: SceneSnapshot, hits: Hits, directions: F32) -> SurfacePoints:

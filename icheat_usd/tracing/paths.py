@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,6 +83,7 @@ def first_surfaces(
             if not followed.any():
                 return ends
         else:
+            kept: Any
             for kept, now in zip(ends.points, points, strict=True):
                 kept[path] = now
             ends.throughput[path] = throughput
@@ -144,7 +145,8 @@ def transmittance(
         if not len(alive):
             return np.repeat(left[:, None], 3, 1)
         ray, origins, directions, limits = ray[alive], origins[alive], directions[alive], limits[alive]
-        hits = Hits(*(column[alive] for column in hits))
+        columns: list[Any] = [column[alive] for column in hits]
+        hits = Hits(*columns)
         points = shade_hits(snapshot, hits, directions)
         share = np.empty(len(ray), np.float32)
         tracing.straight_transmittance(points, directions, share)

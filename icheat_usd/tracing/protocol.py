@@ -74,7 +74,7 @@ def spawn_origins(positions: ArrayLike, normals: ArrayLike, directions: ArrayLik
     Returns
     -------
     (n, 3) float32
-        Offsets are 2^-17 of the larger of magnitude and position: nothing in metres, so a scaled scene
+        Offsets are 2^-18 of the larger of magnitude and position: nothing in metres, so a scaled scene
         gives the same image.
     """
     from icheat_usd.kernels import tracing
