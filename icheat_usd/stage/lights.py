@@ -337,6 +337,14 @@ class _Reader:
             radiance *= np.array(list(UsdLux.BlackbodyTemperatureAsRgb(kelvin)), np.float64)
         if size_factor is not None and self._value(prim, "normalize", False):
             radiance /= size_factor
+        if not (np.isfinite(radiance).all() and (radiance >= 0.0).all()):
+            self.report.once(
+                prim.GetPath(),
+                "radiance",
+                f"{prim.GetPath()} has a negative or infinite radiance, which counts as 0; "
+                "check its color, intensity and exposure.",
+            )
+            radiance = np.where(np.isfinite(radiance), np.maximum(radiance, 0.0), 0.0)
         return radiance
 
     def _number(self, prim: Usd.Prim, name: str, default: float) -> float:
@@ -382,6 +390,9 @@ class _Reader:
             elif not plain:
                 self._unsupported(prim, "MeshLightAPI", "its light inputs are ignored, and its material alone shines")
             self._report_unsupported(prim, kind)
+            return
+        if prim.IsA(UsdGeom.Gprim):
+            self._unsupported(prim, "LightAPI", f"a {kind} shines by the emission of its material alone")
             return
         self._unsupported(prim, kind or "LightAPI", "it gives no light")
 

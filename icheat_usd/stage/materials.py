@@ -312,9 +312,12 @@ class MaterialLibrary:
         scale = _rgba(value("scale"), (1.0, 1.0, 1.0, 1.0))
         bias = _rgba(value("bias"), (0.0, 0.0, 0.0, 0.0))
         asset = value("file")
+        color_space = str(value("sourceColorSpace") or "auto")
+        if color_space not in ("auto", "raw", "sRGB"):
+            self._unsupported(row, f"sourceColorSpace '{color_space}'", "'auto' is used")
         texture = self.textures.add(
             asset if isinstance(asset, (Sdf.AssetPath, str)) else "",
-            str(value("sourceColorSpace") or "auto"),
+            color_space,
             str(value("wrapS") or "useMetadata"),
             str(value("wrapT") or "useMetadata"),
             prim_path=_scene_path(node.GetPrim()),
@@ -346,7 +349,7 @@ class MaterialLibrary:
         while source.node and source.node.GetShaderId() == "UsdTransform2d":
             total = total @ self._transform_2d(source.node)
             source = resolve_input(source.node, "in", self.time)
-        if source.node and source.node.GetShaderId() in ("UsdPrimvarReader_float2", "UsdPrimvarReader_vector2"):
+        if source.node and source.node.GetShaderId() == "UsdPrimvarReader_float2":
             name = str(resolve_input(source.node, "varname", self.time).value or "")
             if name:
                 return total[:2], name
