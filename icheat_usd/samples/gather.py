@@ -4,12 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from icheat_usd.lighting import LightSampler
-from icheat_usd.samples.locate import Locator
-from icheat_usd.samples.tree import ClusterTree
+import numpy as np
+
+from icheat_usd.kernels import samples as kernels
+from icheat_usd.kernels.rows import mean_over_segments
+from icheat_usd.lighting import LightSampler, irradiance
+from icheat_usd.materials import concatenate_points, effective_albedo, points_on_surface, take_points
+from icheat_usd.samples.locate import Locator, build_locator
+from icheat_usd.samples.tree import ClusterTree, build_tree, split_samples
 from icheat_usd.samples.view import ViewSamples
-from icheat_usd.scene import F32, I32, I64, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer
+from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
+
+_PILOT_POINTS = 16384
+_PILOT_RAYS = 8  # per point: enough to see a surface that fills a millionth of what all points see
+_AREA_SHARE = 0.2  # of the samples by area alone: what the pilot missed still gets some
+_UNSEEN_SHARE = 0.25  # of the samples at most, for sides that the pilot never saw
+_CELLS_AT_ONCE = 16384  # of direct light, to bound memory
 
 
 @dataclass(frozen=True)
@@ -28,7 +39,7 @@ class GatherSamples:
     cell_begin: I64  #: (n + 1,) first patch point of each cell; every cell has one or more
     locator: Locator
     n_shared_clusters: int  #: cells that stand for several sides of surfaces, because `n` was too small
-    n_surfaces_without_own: int  #: instances that have no cell of their own
+    n_surfaces_without_own: int  #: instances with area that have no cell of their own
 
     @property
     def n(self) -> int:
@@ -37,6 +48,19 @@ class GatherSamples:
     def locate(self, points: SurfacePoints) -> I32:
         """Cell of each point; -1 where a point is no hit (``instance == -1``)."""
         return self.locator.locate(points.position, points.normal, points.instance, points.side)
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """Groups of samples in tree order: a side of an instance each, or several sides that share a cluster."""
+
+    names: list[tuple[str, ...]]
+    count: I64  #: (n_slots,) samples of each
+    area: F64  #: (n_slots,) square metres, both sides of a surface counted
+    members: list[I64]  #: sides ``2 * instance + side`` of each slot
+    of_side: I32  #: (2 * n_instances,) slot of each side
+    shared: int
+    without_own: int
 
 
 def gather_samples(
@@ -48,12 +72,227 @@ def gather_samples(
     seed: int = 0,
     n_patches_per_cell: int = 8,
 ) -> GatherSamples:
-    """Spread gather samples where they matter to the view."""
-    raise NotImplementedError
+    """Spread gather samples where they matter to the view.
+
+    A pilot of gather rays from some view samples, and one more bounce,
+    measures how much of what the view receives comes from each side of each
+    instance. Samples are shared out by that (and a fifth by area); on a side
+    they are uniform in area. Every side has one sample or more as long as `n`
+    allows; what it does not allow shares clusters, which are counted.
+
+    Parameters
+    ----------
+    n
+        Cells wanted; there are never more.
+    n_patches_per_cell
+        Mean number of patch points of a cell.
+
+    Raises
+    ------
+    ValueError
+        `n` is not positive, or nothing in the scene has an area.
+    """
+    if n < 1:
+        raise ValueError(f"a gather set needs at least one sample, not {n}")
+    geometry = snapshot.geometry
+    area = np.zeros(snapshot.n_instances, np.float64)
+    kernels.instance_areas(
+        geometry.points, geometry.mesh_begin, geometry.instance_mesh, geometry.instance_to_world, area
+    )
+    if not np.any(area > 0):
+        raise ValueError("no surface of the scene has an area, so nothing can reflect light")
+    slots = _share_out(snapshot, area, _pilot(snapshot, tracer, view, seed), n)
+
+    slot_begin = np.concatenate([[0], np.cumsum(slots.count)]).astype(np.int64)
+    points = _spread(snapshot, area, slots, slots.count, seed, 1)
+    shape = split_samples(slots.names, slot_begin, points.position, points.normal)
+    points = take_points(points, shape.order)
+    locator = build_locator(points.position, points.normal, shape, _depth_bound(n), slots.of_side, slot_begin)
+
+    patches = _spread(snapshot, area, slots, slots.count * n_patches_per_cell, seed, 2)
+    cell = locator.locate(patches.position, patches.normal, patches.instance, patches.side)
+    count = np.bincount(cell, minlength=len(points.instance))
+    lonely = np.flatnonzero(count == 0)
+    patches = concatenate_points(patches, take_points(points, lonely))
+    cell = np.concatenate([cell, lonely.astype(np.int32)])
+    by_cell = np.argsort(cell, kind="stable")
+    count = np.maximum(count, 1)
+    slot_of = np.repeat(np.arange(len(slots.count)), slots.count)
+    cell_area = slots.area[slot_of] * count / np.bincount(slot_of, count)[slot_of]
+
+    identity = "\n".join("/".join(name) for name in slots.names).encode()
+    identity += slot_of.astype("<i4").tobytes() + points.face.astype("<i4").tobytes()
+    identity += points.face_uv.astype("<f4").tobytes()
+    tree = build_tree(shape, cell_area, identity)
+    return GatherSamples(
+        points=points,
+        area=cell_area.astype(np.float32),
+        tree=tree,
+        patch_points=take_points(patches, by_cell),
+        patch_cell=cell[by_cell],
+        cell_begin=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+        locator=locator,
+        n_shared_clusters=slots.shared,
+        n_surfaces_without_own=slots.without_own,
+    )
 
 
 def cell_direct(
     snapshot: SceneSnapshot, tracer: Tracer, sampler: LightSampler, gather: GatherSamples, n_samples: int, seed: int
 ) -> F32:
-    """Direct light that each cell reflects diffusely, per light: (n_lights, n_gather, 3) radiance."""
-    raise NotImplementedError
+    """Direct light that each cell reflects diffusely, averaged over its patch points.
+
+    Parameters
+    ----------
+    n_samples
+        Shadow rays per patch point and light.
+
+    Returns
+    -------
+    (n_lights, n_gather, 3) float32, radiance, scene-linear
+        Effective albedo times irradiance over pi. Emission is not in it.
+    """
+    out = np.empty((len(snapshot.lights.kind), gather.n, 3), np.float32)
+    for first in range(0, gather.n, _CELLS_AT_ONCE):
+        last = min(first + _CELLS_AT_ONCE, gather.n)
+        begin = gather.cell_begin[first : last + 1]
+        points = take_points(gather.patch_points, np.arange(begin[0], begin[-1]))
+        chunk_seed = (seed + 0x9E3779B1 * (first // _CELLS_AT_ONCE)) & 0x7FFFFFFF
+        arriving = irradiance(snapshot, tracer, sampler, points, chunk_seed, n_samples)
+        reflected = arriving * (effective_albedo(points) / np.float32(np.pi))
+        for light, values in enumerate(reflected):
+            mean_over_segments(begin - begin[0], np.ascontiguousarray(values), out[light, first:last])
+    return out
+
+
+def _depth_bound(n: int) -> int:
+    """Nodes on the way down within a slot, which is split at its median."""
+    return int(n).bit_length() + 1
+
+
+def _pilot(snapshot: SceneSnapshot, tracer: Tracer, view: ViewSamples, seed: int) -> F64:
+    """Share of what the view receives that comes from each side, ``2 * instance + side``; zeros if it sees nothing."""
+    importance = np.zeros(2 * snapshot.n_instances, np.float64)
+    if view.n == 0:
+        return importance
+    step = max(1, view.n // _PILOT_POINTS)
+    points = take_points(view.points, np.arange(step // 2, view.n, step))
+    weight = np.ones(len(points.instance))
+    for bounce, n_rays in enumerate((_PILOT_RAYS, 1)):
+        n = len(points.instance)
+        origins, directions = np.empty((n * n_rays, 3), np.float32), np.empty((n * n_rays, 3), np.float32)
+        start = np.empty(n * n_rays, np.int64)
+        kernels.cosine_rays(
+            spawn_points(snapshot, points, points.normal),
+            points.shading_normal,
+            points.normal,
+            np.arange(n + 1),
+            n_rays,
+            (seed * 2 + bounce) & 0xFFFFFFFF,
+            np.arange(n),
+            start,
+            origins,
+            directions,
+        )
+        ends = first_surfaces(snapshot, tracer, origins, directions, seed)
+        weight = weight[start] * ends.throughput.mean(axis=1)
+        hit = np.flatnonzero((ends.points.instance >= 0) & (weight > 0))
+        points, weight = take_points(ends.points, hit), weight[hit]
+        side = 2 * points.instance.astype(np.int64) + points.side
+        importance += np.bincount(side, weight, len(importance))
+        weight *= effective_albedo(points).max(axis=1)
+    return importance
+
+
+def _share_out(snapshot: SceneSnapshot, area: F64, importance: F64, n: int) -> _Slots:
+    """Decide which sides have samples of their own, and how many."""
+    sides = np.flatnonzero(np.repeat(area > 0, 2))
+    seen = importance[sides] > 0
+    hidden = ~np.repeat(importance.reshape(-1, 2).sum(axis=1) > 0, 2)[sides]
+    # First what was seen, most important first; then fronts of surfaces no side of which was seen; then the rest.
+    ranked = sides[np.lexsort((sides, sides % 2, ~hidden, -importance[sides], ~seen))]
+    wanted = int(seen.sum()) + min(int((~seen).sum()), int(n * _UNSEEN_SHARE))
+    shared = 0
+    if wanted < len(ranked) or wanted > n:
+        shared = max(1, n // 8)
+        wanted = min(wanted, n - shared)
+        shared = min(shared, len(ranked) - wanted)
+    own, rest = ranked[:wanted], np.sort(ranked[wanted:])
+
+    name = [_name(snapshot, side) for side in own]
+    members = [own[i : i + 1] for i in range(len(own))]
+    if shared:
+        rest = rest[sorted(range(len(rest)), key=lambda i: _name(snapshot, rest[i]))]
+        for cluster, group in enumerate(np.array_split(rest, shared)):
+            name.append(("~shared", f"{cluster:08d}"))
+            members.append(group)
+    order = sorted(range(len(name)), key=name.__getitem__)
+    members = [members[i] for i in order]
+    of_side = np.zeros(2 * len(area), np.int32)
+    for slot, group in enumerate(members):
+        of_side[group] = slot
+    slot_area = np.array([area[group // 2].sum() for group in members])
+    slot_importance = np.array([importance[group].sum() for group in members])
+    is_shared = np.array([i >= len(own) for i in order])
+
+    weight = np.where(is_shared, 0.0, slot_area)
+    if slot_importance.sum() > 0:
+        by_area = np.where(slot_importance > 0, slot_area, 0.0)
+        weight = (1 - _AREA_SHARE) * slot_importance / slot_importance.sum() + _AREA_SHARE * by_area / by_area.sum()
+        weight[is_shared] = 0
+    count = np.ones(len(members), np.int64)
+    free = n - len(members)
+    if free > 0 and weight.sum() > 0:
+        exact = free * weight / weight.sum()
+        count += np.floor(exact).astype(np.int64)
+        left = n - count.sum()
+        count[np.lexsort((np.arange(len(exact)), -(exact % 1)))[:left]] += 1
+    without_own = np.zeros(len(area), bool)
+    without_own[area > 0] = True
+    without_own[own // 2] = False
+    return _Slots([name[i] for i in order], count, slot_area, members, of_side, shared, int(without_own.sum()))
+
+
+def _name(snapshot: SceneSnapshot, side: int) -> tuple[str, ...]:
+    """Levels above a side: prims, id of the placement, part, instance, side."""
+    instance = int(side) // 2
+    surface = snapshot.surfaces[snapshot.geometry.instance_surface[instance]]
+    prims = surface.path.strip("/").split("/")
+    return (*prims, f"#{surface.instance_id + 1:010d}", surface.part, f"{instance:010d}", str(int(side) % 2))
+
+
+def _spread(snapshot: SceneSnapshot, area: F64, slots: _Slots, count: I64, seed: int, stream: int) -> SurfacePoints:
+    """Area-uniform places, slot after slot; a shared slot spreads them over its members."""
+    sides, counts = [], []
+    for group, wanted in zip(slots.members, count.tolist(), strict=True):
+        if len(group) == 1:
+            sides.append(int(group[0]))
+            counts.append(wanted)
+        else:
+            reached = np.cumsum(area[group // 2])
+            chosen = np.searchsorted(reached, (np.arange(wanted) + 0.5) / wanted * reached[-1])
+            for member, number in zip(*np.unique(chosen, return_counts=True), strict=True):
+                sides.append(int(group[member]))
+                counts.append(int(number))
+    side = np.array(sides, np.int64)
+    begin = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    # By side, so that a surface's samples stay where they are when another surface comes or goes.
+    slot_seed = (side * 0x2545F491 + seed * 0x9E3779B1 + stream * 0x85EBCA6B) & 0xFFFFFFFF
+    triangle = np.empty(begin[-1], np.int32)
+    uv = np.empty((begin[-1], 2), np.float32)
+    geometry = snapshot.geometry
+    kernels.spread_by_area(
+        geometry.points,
+        geometry.mesh_begin,
+        geometry.instance_mesh,
+        geometry.instance_to_world,
+        area,
+        (side // 2).astype(np.int32),
+        begin,
+        slot_seed,
+        triangle,
+        uv,
+    )
+    number = np.diff(begin)
+    instance = np.repeat((side // 2).astype(np.int32), number)
+    return points_on_surface(snapshot, instance, triangle, uv, np.repeat((side % 2).astype(np.uint8), number))

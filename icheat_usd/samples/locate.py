@@ -4,12 +4,73 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from icheat_usd.scene import F32, I32, U8
+import numpy as np
+
+from icheat_usd.kernels import locate as kernels
+from icheat_usd.samples.tree import TreeShape
+from icheat_usd.scene import F32, I32, I64, U8
 
 
 @dataclass(frozen=True)
 class Locator:
-    """Nearest gather sample on the same side of the same instance."""
+    """Nearest gather sample on the same side of the same instance.
+
+    Samples whose normal is within 60 degrees of the place's come first: a thin
+    wall modelled as one closed mesh has both its faces on the front side.
+    Of samples at equal distance the first in tree order is taken. Sides that
+    share a cluster find the cluster.
+    """
+
+    table: kernels.LocatorTable
+    depth: int  #: nodes on the longest way down
 
     def locate(self, position: F32, normal: F32, instance: I32, side: U8) -> I32:
-        raise NotImplementedError
+        """Sample of each place: (n,) int32, -1 where `instance` is -1.
+
+        Parameters
+        ----------
+        position, normal : (n, 3) float32
+            World metres; unit geometric normals, turned to `side`.
+        instance : (n,) int32
+        side : (n,) uint8
+        """
+        out = np.empty(len(instance), np.int32)
+        kernels.locate(
+            self.table,
+            self.depth,
+            np.require(position, np.float32, ["C", "W"]),
+            np.require(normal, np.float32, ["C", "W"]),
+            np.require(instance, np.int32, ["C", "W"]),
+            np.require(side, np.uint8, ["C", "W"]),
+            out,
+        )
+        return out
+
+
+def build_locator(position: F32, normal: F32, shape: TreeShape, depth: int, slot: I32, slot_begin: I64) -> Locator:
+    """Prepare look-ups among samples.
+
+    Parameters
+    ----------
+    position, normal : (n, 3) float32
+        In the order of the tree's leaves.
+    slot : (n_instances * 2,)
+        Group of samples of each side, at ``2 * instance + side``.
+    slot_begin : (n_groups + 1,)
+        Samples of each group, as the tree was built.
+    """
+    box = np.empty((len(shape.lo), 6), np.float32)
+    position = np.require(position, np.float32, ["C", "W"])
+    kernels.build_boxes(position, shape.lo, shape.mid, shape.hi, box)
+    table = kernels.LocatorTable(
+        position,
+        np.require(normal, np.float32, ["C", "W"]),
+        shape.lo,
+        shape.mid,
+        shape.hi,
+        box,
+        np.ascontiguousarray(slot, np.int32),
+        slot_begin.astype(np.int32),
+        shape.group_node,
+    )
+    return Locator(table, depth)

@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from icheat_usd.scene import F32, I32, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer
+import numpy as np
+
+from icheat_usd.kernels.camera import camera_rays
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.lighting import environment_radiance
+from icheat_usd.materials import concatenate_points, dielectric_split, empty_points, shade_hits, take_points
+from icheat_usd.scene import F32, F64, I32, I64, DeltaKind, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
+
+_RAYS_AT_ONCE = 1 << 19
+_MAX_DEPTH = 16  # deltas along a path that never needs to choose
 
 
 @dataclass(frozen=True)
@@ -31,8 +41,194 @@ class ViewSamples:
         return len(self.pixel)
 
 
+class _Paths(NamedTuple):
+    """Camera paths on their way."""
+
+    pixel: I32
+    origin: F32
+    direction: F32  # unit
+    throughput: F32
+    travelled: F32
+    splits: I32  # how often this path was divided so far
+
+    def take(self, rows: I64) -> _Paths:
+        return _Paths(*(np.ascontiguousarray(column[rows]) for column in self))
+
+
+class _Found(NamedTuple):
+    """Ends of camera paths."""
+
+    pixel: I32
+    throughput: F32
+    points: SurfacePoints
+    to_eye: F32
+    depth: F32
+
+
 def view_samples(
     snapshot: SceneSnapshot, tracer: Tracer, *, samples_per_pixel: int = 1, seed: int = 0, max_splits: int = 2
 ) -> ViewSamples:
-    """Trace the camera's rays to the points that it sees."""
-    raise NotImplementedError
+    """Trace the camera's rays to the points that it sees.
+
+    Mirrors and holes are followed. Smooth glass and translucent surfaces
+    divide a path in two, so that both what they reflect and what shines
+    through have view samples.
+
+    Parameters
+    ----------
+    samples_per_pixel
+        1 looks through pixel centres and the centre of the lens; more are
+        stratified over the pixel (box filter) and the lens.
+    max_splits
+        Divisions of one path; where more would follow, one continuation is chosen at random.
+
+    Raises
+    ------
+    ValueError
+        `samples_per_pixel` is less than 1.
+    """
+    if samples_per_pixel < 1:
+        raise ValueError(f"a pixel needs at least one sample, not {samples_per_pixel}")
+    camera = snapshot.camera
+    n_pixels = camera.width * camera.height
+    background = np.zeros((n_pixels, 3), np.float64)
+    found: list[_Found] = []
+    at_once = max(1, _RAYS_AT_ONCE // samples_per_pixel)
+    for first in range(0, n_pixels, at_once):
+        n = (min(first + at_once, n_pixels) - first) * samples_per_pixel
+        paths, limit = _camera_paths(snapshot, first, n, samples_per_pixel, seed)
+        found += _follow(
+            snapshot, tracer, paths, limit, int(hash_combine(seed & 0xFFFFFFFF, first)), max_splits, background
+        )
+    pixel = np.concatenate([np.empty(0, np.int32), *(part.pixel for part in found)])
+    order = np.argsort(pixel, kind="stable")
+    points = concatenate_points(empty_points(0), *(part.points for part in found))
+
+    def ordered(name: str, width: tuple[int, ...]) -> F32:
+        parts = [np.empty((0, *width), np.float32), *(getattr(part, name) for part in found)]
+        return np.ascontiguousarray(np.concatenate(parts)[order])
+
+    return ViewSamples(
+        camera.width,
+        camera.height,
+        samples_per_pixel,
+        pixel[order],
+        ordered("throughput", (3,)),
+        take_points(points, order),
+        ordered("to_eye", (3,)),
+        ordered("depth", ()),
+        background.astype(np.float32),
+    )
+
+
+def _camera_paths(snapshot: SceneSnapshot, first: int, n: int, spp: int, seed: int) -> tuple[_Paths, F32]:
+    """Paths of the pixels from `first` on, begun at the near plane, and the length to the far plane."""
+    camera = snapshot.camera
+    origin, direction = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+    axial = np.empty(n, np.float64)
+    camera_rays(
+        np.ascontiguousarray(camera.to_world, np.float64),
+        camera.window,
+        camera.width,
+        first,
+        camera.height,
+        camera.orthographic,
+        camera.lens_radius,
+        max(camera.focus_distance, 1e-9),
+        spp,
+        seed & 0xFFFFFFFF,
+        origin,
+        direction,
+        axial,
+    )
+    near = (camera.near / axial).astype(np.float32)
+    limit = ((camera.far - camera.near) / axial).astype(np.float32)
+    if camera.near > 0:
+        origin += near[:, None] * direction
+    pixel = (first + np.arange(n) // spp).astype(np.int32)
+    throughput = np.full((n, 3), 1.0 / spp, np.float32)
+    return _Paths(pixel, origin, direction, throughput, near, np.zeros(n, np.int32)), limit
+
+
+def _follow(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    paths: _Paths,
+    limit: F32 | None,
+    seed: int,
+    max_splits: int,
+    background: F64,
+) -> list[_Found]:
+    """Follow paths to their ends; what leaves the scene goes into `background`."""
+    found: list[_Found] = []
+    for _ in range(_MAX_DEPTH):
+        if not len(paths.pixel):
+            break
+        hits = tracer.intersect(paths.origin, paths.direction, limit)
+        limit = None
+        points = shade_hits(snapshot, hits, paths.direction)
+        _escape(snapshot, paths, np.flatnonzero(points.instance < 0), background)
+        scatters = (points.instance >= 0) & (points.delta == DeltaKind.NONE)
+        solid = np.flatnonzero(scatters & (points.opacity >= 1))
+        found.append(_end(paths, points, hits.distance, solid, None))
+        carry_on = np.flatnonzero((points.instance >= 0) & ~(scatters & (points.opacity >= 1)))
+        if not len(carry_on):
+            return found
+
+        paths, points, length = paths.take(carry_on), take_points(points, carry_on), hits.distance[carry_on]
+        split = dielectric_split(points, paths.direction)
+        reflects = split.weight_reflected.max(axis=1) > 0
+        refracts = split.weight_refracted.max(axis=1) > 0
+        stays = (points.delta == DeltaKind.NONE) & (points.opacity > 0)
+        divides = reflects.astype(np.int32) + refracts + stays > 1
+        chosen = divides & (paths.splits >= max_splits)
+        found += _follow_by_chance(snapshot, tracer, paths.take(np.flatnonzero(chosen)), seed, background)
+        followed = ~chosen
+        found.append(_end(paths, points, length, np.flatnonzero(stays & followed), points.opacity))
+        travelled = paths.travelled + length
+        splits = paths.splits + divides
+        parts = []
+        for goes, direction, weight in (
+            (reflects & followed, split.reflected, split.weight_reflected),
+            (refracts & followed, split.refracted, split.weight_refracted),
+        ):
+            rows = np.flatnonzero(goes)
+            turned = np.ascontiguousarray(direction[rows])
+            origin = spawn_points(snapshot, take_points(points, rows), turned)
+            throughput = paths.throughput[rows] * weight[rows]
+            parts.append(_Paths(paths.pixel[rows], origin, turned, throughput, travelled[rows], splits[rows]))
+        paths = _Paths(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return found
+
+
+def _follow_by_chance(
+    snapshot: SceneSnapshot, tracer: Tracer, paths: _Paths, seed: int, background: F64
+) -> list[_Found]:
+    if not len(paths.pixel):
+        return []
+    ends = first_surfaces(snapshot, tracer, paths.origin, paths.direction, seed)
+    paths = paths._replace(direction=ends.direction, throughput=paths.throughput * ends.throughput)
+    alive = paths.throughput.max(axis=1) > 0
+    _escape(snapshot, paths, np.flatnonzero(alive & (ends.points.instance < 0)), background)
+    return [_end(paths, ends.points, ends.distance, np.flatnonzero(alive & (ends.points.instance >= 0)), None)]
+
+
+def _escape(snapshot: SceneSnapshot, paths: _Paths, rows: I64, background: F64) -> None:
+    if len(rows) and np.any(snapshot.lights.kind == LightKind.DOME):
+        sky = environment_radiance(snapshot, np.ascontiguousarray(paths.direction[rows]))
+        seen = paths.throughput[rows].astype(np.float64) * sky
+        for channel in range(3):
+            background[:, channel] += np.bincount(paths.pixel[rows], seen[:, channel], len(background))
+
+
+def _end(paths: _Paths, points: SurfacePoints, length: F32, rows: I64, share: F32 | None) -> _Found:
+    throughput = paths.throughput[rows]
+    if share is not None:
+        throughput = throughput * share[rows, None]
+    return _Found(
+        paths.pixel[rows],
+        throughput,
+        take_points(points, rows),
+        -paths.direction[rows],
+        paths.travelled[rows] + length[rows],
+    )

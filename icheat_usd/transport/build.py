@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
+from icheat_usd.kernels import rows as row_kernels
+from icheat_usd.kernels import transport as kernels
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.samples import cosine_rays
+from icheat_usd.materials import effective_albedo, is_glossy, sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, I32, SceneSnapshot
-from icheat_usd.tracing import Tracer
-from icheat_usd.transport.sparse import SparseRows
+from icheat_usd.scene import F32, I32, I64, U8, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
+from icheat_usd.transport.interpolate import sparse_rows_of_view
+from icheat_usd.transport.sparse import SparseRows, concatenate_rows
+
+_RAYS_AT_ONCE = 1 << 20
+_CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
 
 
 @dataclass(frozen=True)
@@ -36,8 +48,23 @@ class Transport:
     interpolation: SparseRows | None  #: (n_view x n_rows); None where rows are view samples
 
     def to_view(self, radiance: F32) -> F32:
-        """Indirect radiance of the view samples for `radiance` (n_gather, 3) that leaves the cells: (n_view, 3)."""
-        raise NotImplementedError
+        """Indirect radiance that view samples send to the eye.
+
+        Parameters
+        ----------
+        radiance : (n_gather, 3) float32
+            What leaves the cells.
+
+        Returns
+        -------
+        (n_view, 3) float32
+        """
+        out = np.zeros((len(self.lobes[0].tint), 3), np.float32)
+        for lobe in self.lobes:
+            if lobe.rows.n_entries:
+                product = lobe.rows.matmul(radiance)
+                out += lobe.tint * (product if self.interpolation is None else self.interpolation.matmul(product))
+        return out
 
 
 def build_transport(
@@ -52,10 +79,249 @@ def build_transport(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Transport:
-    """Measure the transport with gather rays."""
-    raise NotImplementedError
+    """Measure the transport with gather rays.
+
+    A diffuse weight is the share of a point's cosine-distributed rays that end
+    in a cell; albedo stays outside, so textures stay sharp. Mirrors, glass and
+    cut-outs on the way are followed and their mean throughput counted in.
+    Rays that leave the scene add nothing: domes are direct light.
+
+    Parameters
+    ----------
+    rays_per_row, rays_per_bounce_row
+        Rays per view sample and lobe, and per cell; powers of two stratify best.
+    row_spacing
+        1 computes a row at every view sample. Larger values compute rows on a
+        pixel grid of this spacing (and wherever no row nearby fits) and
+        interpolate between them.
+
+    Notes
+    -----
+    Bitwise the same for any number of threads.
+    """
+    row_view: I32 = np.arange(view.n, dtype=np.int32)
+    interpolation = None
+    if row_spacing > 1:
+        row_view, interpolation = sparse_rows_of_view(view, snapshot.camera, row_spacing)
+    builder = _RowBuilder(snapshot, tracer, gather, seed)
+
+    stream = row_view.astype(np.int64)
+    one_each = np.arange(len(row_view) + 1, dtype=np.int64)
+    points = take_points(view.points, stream)
+    diffuse = builder.diffuse_rows(points, one_each, stream, rays_per_row, 0, progress, "gather rays")
+    lobes = [Lobe("diffuse", diffuse, view.points.albedo)]
+
+    glossy = np.flatnonzero(is_glossy(points))
+    if len(glossy):
+        base, edge = builder.specular_rows(
+            take_points(points, glossy), view.to_eye[row_view[glossy]], stream[glossy], rays_per_row, progress
+        )
+        lobes.append(Lobe("specular_base", _spread_rows(base, glossy, len(row_view)), view.points.specular))
+        edge_tint = np.repeat(view.points.specular_edge[:, None], 3, axis=1)
+        lobes.append(Lobe("specular_edge", _spread_rows(edge, glossy, len(row_view)), edge_tint))
+
+    bounce = builder.diffuse_rows(
+        gather.patch_points,
+        gather.cell_begin,
+        np.arange(gather.n, dtype=np.int64),
+        rays_per_bounce_row,
+        1,
+        progress,
+        "bounce rays",
+    )
+    albedo = np.empty((gather.n, 3), np.float32)
+    row_kernels.mean_over_segments(gather.cell_begin, effective_albedo(gather.patch_points), albedo)
+    return Transport(tuple(lobes), bounce, albedo, row_view, interpolation)
 
 
 def solve_bounces(transport: Transport, direct: F32, n_bounces: int) -> F32:
-    """Radiance that leaves the cells after up to `n_bounces` diffuse reflections: (n_lights, n_gather, 3)."""
-    raise NotImplementedError
+    """Radiance that leaves the cells after one to `n_bounces` diffuse reflections.
+
+    Jacobi steps of ``g = b + albedo * (R g)``, stopped when a step changes less
+    than 1e-4 of the total.
+
+    Parameters
+    ----------
+    direct : (n_lights, n_gather, 3) float32
+        Reflected direct radiance b, per light.
+    n_bounces
+        1 returns `direct` as it is.
+
+    Returns
+    -------
+    (n_lights, n_gather, 3) float32
+
+    Raises
+    ------
+    ValueError
+        `n_bounces` is less than 1, or `direct` belongs to another gather set.
+    """
+    if n_bounces < 1:
+        raise ValueError(f"light needs at least one reflection on the way to a gather cell, not {n_bounces}")
+    if direct.ndim != 3 or direct.shape[1:] != (transport.bounce.n_rows, 3):
+        raise ValueError(f"direct light of shape {direct.shape} for {transport.bounce.n_rows} gather cells")
+    out = direct.astype(np.float32, copy=True)
+    for light in range(len(direct)):
+        last = direct[light]
+        for _ in range(n_bounces - 1):
+            last = transport.gather_albedo * transport.bounce.matmul(last)
+            out[light] += last
+            if np.abs(last).sum(dtype=np.float64) <= _CONVERGED * np.abs(out[light]).sum(dtype=np.float64):
+                break
+    return out
+
+
+def routed_triangles(snapshot: SceneSnapshot) -> U8:
+    """Triangles on which a path may go straight on or be mirrored: 1 where a hit must be looked at more closely."""
+    m = snapshot.materials
+    textured = m.texture >= 0
+    opacity = (m.opacity < 1) | textured[:, 5]
+    smooth = (m.roughness <= 0.01) | textured[:, 4]
+    dark = (m.metallic > 0.99) | textured[:, 3] | textured[:, 0] | np.all(m.diffuse <= 0, axis=1)
+    dark |= m.use_display_color.astype(bool)
+    return (opacity | (smooth & dark)).astype(np.uint8)[snapshot.geometry.material]
+
+
+class _RowBuilder:
+    """Traces rays of many rows at a time and merges their hits."""
+
+    def __init__(self, snapshot: SceneSnapshot, tracer: Tracer, gather: GatherSamples, seed: int) -> None:
+        self._snapshot, self._tracer, self._gather, self._seed = snapshot, tracer, gather, seed
+        self._route = routed_triangles(snapshot)
+
+    def diffuse_rows(
+        self,
+        points: SurfacePoints,
+        point_begin: I64,
+        stream: I64,
+        n_rays: int,
+        purpose: int,
+        progress: Progress,
+        step: str,
+    ) -> SparseRows:
+        """Rows of cosine-distributed rays; row r starts from points ``point_begin[r]:point_begin[r + 1]``."""
+        seed = self._seed_for(purpose)
+        clear = spawn_points(self._snapshot, points, points.normal)
+
+        def row_chunk(first: int, last: int) -> SparseRows:
+            n = (last - first) * n_rays
+            origins, directions = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+            cosine_rays(
+                clear,
+                points.shading_normal,
+                points.normal,
+                point_begin[first : last + 1],
+                n_rays,
+                seed,
+                stream[first:last],
+                np.empty(n, np.int64),
+                origins,
+                directions,
+            )
+            cell, weight = self._cells(origins, directions, _mix(seed, 1 + first))
+            if weight is None:
+                return self._merge_counts(cell, n_rays)
+            return self._merge(cell, weight / np.float32(n_rays), n_rays)
+
+        return self._in_chunks(len(stream), n_rays, row_chunk, progress, step)
+
+    def specular_rows(
+        self, points: SurfacePoints, to_eye: F32, stream: I64, n_rays: int, progress: Progress
+    ) -> tuple[SparseRows, SparseRows]:
+        """Rows that multiply the specular colour, and rows that multiply the specular edge."""
+        seed = self._seed_for(2)
+        edges: list[SparseRows] = []
+
+        def row_chunk(first: int, last: int) -> SparseRows:
+            start = np.repeat(np.arange(first, last), n_rays)
+            u = np.empty((len(start), 2), np.float32)
+            kernels.point_sets(seed, stream[first:last], n_rays, u)
+            many = take_points(points, start)
+            directions, to_base, to_edge = sample_specular(many, np.ascontiguousarray(to_eye[start]), u)
+            origins = spawn_points(self._snapshot, many, directions)
+            cell, weight = self._cells(origins, directions, _mix(seed, 1 + first))
+            scale = np.float32(1.0 / n_rays) if weight is None else weight / np.float32(n_rays)
+            edges.append(self._merge(cell, to_edge * scale, n_rays))
+            return self._merge(cell, to_base * scale, n_rays)
+
+        base = self._in_chunks(len(stream), 4 * n_rays, row_chunk, progress, "glossy gather rays")
+        return base, concatenate_rows(edges, self._gather.n)
+
+    def _seed_for(self, purpose: int) -> int:
+        return _mix(self._seed, purpose)
+
+    def _in_chunks(
+        self, n_rows: int, n_rays: int, row_chunk: Callable[[int, int], SparseRows], progress: Progress, step: str
+    ) -> SparseRows:
+        parts = []
+        at_once = max(1, _RAYS_AT_ONCE // n_rays)
+        progress(step, 0.0)
+        for first in range(0, n_rows, at_once):
+            last = min(first + at_once, n_rows)
+            parts.append(row_chunk(first, last))
+            progress(step, last / n_rows)
+        return concatenate_rows(parts, self._gather.n)
+
+    def _cells(self, origins: F32, directions: F32, seed: int) -> tuple[I32, F32 | None]:
+        """Cell that each ray ends in and its throughput; None for the throughput where it is 1 for all."""
+        hits = self._tracer.intersect(origins, directions)
+        cell = np.empty(len(origins), np.int32)
+        detour = np.empty(len(origins), np.uint8)
+        geometry, locator = self._snapshot.geometry, self._gather.locator
+        kernels.cells_of_hits(
+            locator.table,
+            locator.depth,
+            geometry.points,
+            geometry.instance_to_world,
+            geometry.instance_to_object,
+            self._route,
+            directions,
+            hits.instance,
+            hits.triangle,
+            hits.u,
+            hits.v,
+            cell,
+            detour,
+        )
+        rest = np.flatnonzero(detour)
+        if not len(rest):
+            return cell, None
+        ends = first_surfaces(self._snapshot, self._tracer, origins[rest], directions[rest], seed)
+        cell[rest] = self._gather.locate(ends.points)
+        weight = np.ones(len(cell), np.float32)
+        weight[rest] = ends.throughput.mean(axis=1)
+        return cell, weight
+
+    def _merge_counts(self, cell: I32, n_rays: int) -> SparseRows:
+        n = len(cell) // n_rays
+        counts = np.empty(n, np.int64)
+        merged = np.empty((n, n_rays), np.int32)
+        weights = np.empty((n, n_rays), np.float32)
+        kernels.merge_counts(cell, n_rays, counts, merged, weights)
+        return self._pack(np.arange(n + 1) * n_rays, counts, merged.reshape(-1), weights.reshape(-1))
+
+    def _merge(self, cell: I32, weight: F32, n_rays: int) -> SparseRows:
+        n = len(cell) // n_rays
+        counts = np.empty(n, np.int64)
+        merged, weights = np.empty_like(cell), np.empty(len(cell), np.float32)
+        begin = np.arange(n + 1) * n_rays
+        kernels.merge_weights(begin, cell, np.ascontiguousarray(weight, np.float32), counts, merged, weights)
+        return self._pack(begin, counts, merged, weights)
+
+    def _pack(self, begin: I64, counts: I64, cell: I32, weight: F32) -> SparseRows:
+        indptr = np.concatenate([[0], np.cumsum(counts)])
+        indices = np.empty(indptr[-1], np.int32)
+        weights = np.empty(indptr[-1], np.float32)
+        kernels.pack_segments(begin, counts, indptr, cell, weight, indices, weights)
+        return SparseRows(indptr, indices, weights, self._gather.n)
+
+
+def _mix(seed: int, value: int) -> int:
+    return int(hash_combine(seed & 0xFFFFFFFF, value))
+
+
+def _spread_rows(rows: SparseRows, place: I64, n_rows: int) -> SparseRows:
+    """The same rows at `place` among `n_rows`, the others empty."""
+    counts = np.zeros(n_rows, np.int64)
+    counts[place] = np.diff(rows.indptr)
+    return SparseRows(np.concatenate([[0], np.cumsum(counts)]), rows.indices, rows.weights, rows.n_columns)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icheat_usd.kernels import rows as kernels
 from icheat_usd.scene import F32, I32, I64
 
 
@@ -23,13 +24,69 @@ class SparseRows:
         return len(self.indptr) - 1
 
     @property
+    def n_entries(self) -> int:
+        return len(self.indices)
+
+    @property
     def shape(self) -> tuple[int, int]:
         return self.n_rows, self.n_columns
 
+    @classmethod
+    def empty(cls, n_rows: int, n_columns: int) -> SparseRows:
+        """All zero."""
+        return cls(np.zeros(n_rows + 1, np.int64), np.empty(0, np.int32), np.empty(0, np.float32), n_columns)
+
     def matmul(self, b: F32) -> F32:
-        """Product with `b` (n_columns, k): (n_rows, k). Bitwise the same for any number of threads."""
-        raise NotImplementedError
+        """Product with a dense matrix, bitwise the same for any number of threads.
+
+        Parameters
+        ----------
+        b : (n_columns, k) float32
+
+        Returns
+        -------
+        (n_rows, k) float32
+
+        Raises
+        ------
+        ValueError
+            `b` has another number of rows than this matrix has columns.
+        """
+        if b.ndim != 2 or len(b) != self.n_columns:
+            raise ValueError(f"the right side of a product with {self.shape} rows has shape {b.shape}")
+        b = np.require(b, np.float32, ["C", "W"])
+        out = np.empty((self.n_rows, b.shape[1]), np.float32)
+        product = kernels.rows_times_3 if b.shape[1] == 3 else kernels.rows_times
+        product(self.indptr, self.indices, self.weights, b, out)
+        return out
 
     def row_sums(self) -> F32:
         """Sum of the weights of each row: (n_rows,)."""
-        return self.matmul(np.ones((self.n_columns, 1), np.float32))[:, 0]
+        out = np.empty(self.n_rows, np.float32)
+        kernels.row_sums(self.indptr, self.weights, out)
+        return out
+
+    def rows(self, begin: int, end: int) -> SparseRows:
+        """Rows ``begin:end`` as a matrix of their own."""
+        first, last = self.indptr[begin], self.indptr[end]
+        return SparseRows(
+            self.indptr[begin : end + 1] - first, self.indices[first:last], self.weights[first:last], self.n_columns
+        )
+
+
+def concatenate_rows(parts: list[SparseRows], n_columns: int) -> SparseRows:
+    """Stack matrices on top of each other; `parts` is emptied on the way, so memory never holds two copies."""
+    counts = [part.n_entries for part in parts]
+    indptr = np.zeros(sum(part.n_rows for part in parts) + 1, np.int64)
+    indices = np.empty(sum(counts), np.int32)
+    weights = np.empty(sum(counts), np.float32)
+    row = entry = 0
+    parts.reverse()
+    while parts:
+        part = parts.pop()
+        indptr[row + 1 : row + part.n_rows + 1] = part.indptr[1:] + entry
+        indices[entry : entry + part.n_entries] = part.indices
+        weights[entry : entry + part.n_entries] = part.weights
+        row += part.n_rows
+        entry += part.n_entries
+    return SparseRows(indptr, indices, weights, n_columns)

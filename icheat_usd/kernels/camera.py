@@ -1,0 +1,64 @@
+"""Rays of the camera."""
+
+from __future__ import annotations
+
+import math
+
+from numba import prange
+
+from icheat_usd.kernels._jit import parallel_kernel
+from icheat_usd.kernels.random import hash_combine, sobol_pair
+
+
+@parallel_kernel
+def camera_rays(  # type: ignore[no-untyped-def]
+    to_world,
+    window,
+    width,
+    first,
+    height,
+    orthographic,
+    lens_radius,
+    focus_distance,
+    n_samples,
+    seed,
+    origins,
+    directions,
+    axial,
+):
+    """Rays of the pixels from `first` on, `n_samples` of each: unit directions, and the cosine to the camera's axis.
+
+    One sample is the pixel's centre through the lens's centre; more are
+    stratified over the pixel's square and the lens's disk.
+    """
+    left, right, bottom, top = window
+    for ray in prange(len(axial)):
+        pixel = first + ray // n_samples
+        k = ray % n_samples
+        px, py = pixel % width, pixel // width
+        u, v, lens_x, lens_y = 0.5, 0.5, 0.0, 0.0
+        if n_samples > 1:
+            stream = hash_combine(seed, pixel)
+            u, v = sobol_pair(k, hash_combine(stream, 0))
+            if lens_radius > 0.0:
+                a, b = sobol_pair(k, hash_combine(stream, 1))
+                radius = lens_radius * math.sqrt(a)
+                lens_x = radius * math.cos(2.0 * math.pi * b)
+                lens_y = radius * math.sin(2.0 * math.pi * b)
+        x = left + (px + u) / width * (right - left)
+        y = top - (py + v) / height * (top - bottom)
+        if orthographic:
+            ox, oy = x, y
+            dx, dy, dz = 0.0, 0.0, -1.0
+        else:
+            ox, oy = lens_x, lens_y
+            dx, dy, dz = x, y, -1.0
+            if lens_radius > 0.0:
+                dx -= lens_x / focus_distance
+                dy -= lens_y / focus_distance
+        scale = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx * scale, dy * scale, dz * scale
+        for c in range(3):
+            origins[ray, c] = to_world[c, 0] * ox + to_world[c, 1] * oy + to_world[c, 3]
+            directions[ray, c] = to_world[c, 0] * dx + to_world[c, 1] * dy + to_world[c, 2] * dz
+        axial[ray] = -dz

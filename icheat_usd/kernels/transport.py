@@ -1,0 +1,281 @@
+"""From gather rays to rows of transport."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.locate import nearest_sample
+from icheat_usd.kernels.random import hash_combine, sobol_pair
+
+_BLOCK = 2048
+
+
+@parallel_kernel
+def cells_of_hits(  # type: ignore[no-untyped-def]
+    table,
+    depth,
+    points,
+    to_world,
+    to_object,
+    triangle_route,
+    directions,
+    instance,
+    triangle,
+    u,
+    v,
+    cell,
+    detour,
+):
+    """Gather cell of every hit, -1 for none; `detour` marks hits on triangles that do not simply reflect.
+
+    The place comes from barycentrics in double precision, not from the ray: a
+    hit far away then still lies on its triangle.
+    """
+    n = len(instance)
+    for block in prange((n + _BLOCK - 1) // _BLOCK):
+        stack = np.empty(depth + 1, np.int64)
+        bound = np.empty(depth + 1, np.float32)
+        for q in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
+            i, t = instance[q], triangle[q]
+            cell[q] = -1
+            detour[q] = 0
+            if i < 0:
+                continue
+            if triangle_route[t] != 0:
+                detour[q] = 1
+                continue
+            b1, b2 = np.float64(u[q]), np.float64(v[q])
+            ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
+            ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
+            fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
+            ox, oy, oz = ax + b1 * ex + b2 * fx, ay + b1 * ey + b2 * fy, az + b1 * ez + b2 * fz
+            m = to_world[i]
+            x = m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz + m[0, 3]
+            y = m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz + m[1, 3]
+            z = m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz + m[2, 3]
+            gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+            w = to_object[i]
+            nx = w[0, 0] * gx + w[1, 0] * gy + w[2, 0] * gz
+            ny = w[0, 1] * gx + w[1, 1] * gy + w[2, 1] * gz
+            nz = w[0, 2] * gx + w[1, 2] * gy + w[2, 2] * gz
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if not length > 0.0:
+                continue
+            side = 0
+            scale = 1.0 / length
+            if nx * directions[q, 0] + ny * directions[q, 1] + nz * directions[q, 2] > 0.0:
+                side = 1
+                scale = -scale
+            cell[q] = nearest_sample(
+                table,
+                i,
+                side,
+                np.float32(x),
+                np.float32(y),
+                np.float32(z),
+                np.float32(nx * scale),
+                np.float32(ny * scale),
+                np.float32(nz * scale),
+                stack,
+                bound,
+            )
+
+
+@kernel
+def _sort(keys, values, n):  # type: ignore[no-untyped-def]
+    """Heap sort by key, then by value, so that the order of equal keys is settled too."""
+    for start in range(n // 2 - 1, -1, -1):
+        _sift(keys, values, start, n)
+    for end in range(n - 1, 0, -1):
+        keys[0], keys[end] = keys[end], keys[0]
+        values[0], values[end] = values[end], values[0]
+        _sift(keys, values, 0, end)
+
+
+@kernel
+def _sift(keys, values, start, end):  # type: ignore[no-untyped-def]
+    root = start
+    while True:
+        child = 2 * root + 1
+        if child >= end:
+            return
+        if child + 1 < end and (
+            keys[child] < keys[child + 1] or (keys[child] == keys[child + 1] and values[child] < values[child + 1])
+        ):
+            child += 1
+        if keys[root] < keys[child] or (keys[root] == keys[child] and values[root] < values[child]):
+            keys[root], keys[child] = keys[child], keys[root]
+            values[root], values[child] = values[child], values[root]
+            root = child
+        else:
+            return
+
+
+@parallel_kernel
+def merge_counts(cell, n_rays, counts, out_cell, out_weight):  # type: ignore[no-untyped-def]
+    """Row r of the output: the distinct cells of its `n_rays` entries of `cell`, each with its share of rays."""
+    unit = np.float32(1.0 / n_rays)
+    for r in prange(len(counts)):
+        keys = np.sort(cell[r * n_rays : (r + 1) * n_rays])
+        count = 0
+        e = 0
+        while e < n_rays and keys[e] < 0:
+            e += 1
+        while e < n_rays:
+            first = e
+            while e < n_rays and keys[e] == keys[first]:
+                e += 1
+            out_cell[r, count] = keys[first]
+            out_weight[r, count] = (e - first) * unit
+            count += 1
+        counts[r] = count
+
+
+@parallel_kernel
+def merge_weights(begin, cell, weight, counts, out_cell, out_weight):  # type: ignore[no-untyped-def]
+    """Row r of the output: cells of entries ``begin[r]:begin[r + 1]``, equal ones added; out of place, from `begin`.
+
+    Entries without a cell or a weight are dropped.
+    """
+    for r in prange(len(counts)):
+        n = begin[r + 1] - begin[r]
+        keys = cell[begin[r] : begin[r + 1]].copy()
+        values = weight[begin[r] : begin[r + 1]].copy()
+        _sort(keys, values, n)
+        count = 0
+        e = 0
+        while e < n:
+            first = e
+            total = 0.0
+            while e < n and keys[e] == keys[first]:
+                total += values[e]
+                e += 1
+            if keys[first] >= 0 and total > 0.0:
+                out_cell[begin[r] + count] = keys[first]
+                out_weight[begin[r] + count] = total
+                count += 1
+        counts[r] = count
+
+
+@parallel_kernel
+def pack_segments(begin, counts, packed_begin, cell, weight, out_cell, out_weight):  # type: ignore[no-untyped-def]
+    """Copy the first ``counts[r]`` entries from ``begin[r]`` to ``packed_begin[r]``."""
+    for r in prange(len(counts)):
+        for e in range(counts[r]):
+            out_cell[packed_begin[r] + e] = cell[begin[r] + e]
+            out_weight[packed_begin[r] + e] = weight[begin[r] + e]
+
+
+@parallel_kernel
+def point_sets(seed, stream, n_rays, out):  # type: ignore[no-untyped-def]
+    """Stratified points of the unit square: ``r * n_rays + k`` is point k of the sequence ``(seed, stream[r])``."""
+    for r in prange(len(stream)):
+        row_seed = hash_combine(seed, stream[r])
+        for k in range(n_rays):
+            u, v = sobol_pair(k, row_seed)
+            out[r * n_rays + k, 0] = u
+            out[r * n_rays + k, 1] = v
+
+
+_NEIGHBOURS = 4
+_SAME_SHEET = np.float32(0.7)  # least cosine between the normals of two points that may share a row
+_OTHER_INSTANCE = np.float32(1.0)  # added to the squared distance: rows of the same surface come first
+_REACH = np.float32(2.0)  # spacings: weights end here
+_ACCEPT = np.float32(1.25)  # spacings: the nearest row must be no further
+
+
+@parallel_kernel
+def interpolation_weights(  # type: ignore[no-untyped-def]
+    position,
+    normal,
+    instance,
+    spacing,
+    block,
+    n_blocks_x,
+    n_blocks_y,
+    row_view,
+    row_of_view,
+    bucket_begin,
+    bucket_row,
+    count,
+    out_row,
+    out_weight,
+):
+    """Up to four rows and their weights for every view sample; count 0 where no row is near enough.
+
+    Squared distance between points: (distance / spacing)^2 + 2 (1 - cos of the
+    normals), candidates from the blocks around the sample's own. Weights after
+    Franke & Little vanish at the distance of the fifth row, so no row comes or
+    goes at once.
+    """
+    for v in prange(len(count)):
+        if row_of_view[v] >= 0:
+            count[v] = 1
+            out_row[v, 0] = row_of_view[v]
+            out_weight[v, 0] = np.float32(1.0)
+            continue
+        near = np.full(_NEIGHBOURS + 1, np.float32(np.inf))
+        best = np.full(_NEIGHBOURS + 1, np.int64(-1))
+        bx, by = block[v] % n_blocks_x, block[v] // n_blocks_x
+        for y in range(max(0, by - 2), min(n_blocks_y, by + 3)):
+            for x in range(max(0, bx - 2), min(n_blocks_x, bx + 3)):
+                place = y * n_blocks_x + x
+                for e in range(bucket_begin[place], bucket_begin[place + 1]):
+                    row = bucket_row[e]
+                    w = row_view[row]
+                    cosine = normal[v, 0] * normal[w, 0] + normal[v, 1] * normal[w, 1] + normal[v, 2] * normal[w, 2]
+                    if cosine < _SAME_SHEET:
+                        continue
+                    dx = (position[w, 0] - position[v, 0]) / spacing[v]
+                    dy = (position[w, 1] - position[v, 1]) / spacing[v]
+                    dz = (position[w, 2] - position[v, 2]) / spacing[v]
+                    # Off the tangent planes is another sheet: a step, the inside of a corner.
+                    off = max(
+                        abs(dx * normal[v, 0] + dy * normal[v, 1] + dz * normal[v, 2]),
+                        abs(dx * normal[w, 0] + dy * normal[w, 1] + dz * normal[w, 2]),
+                    )
+                    if off > np.float32(0.5):
+                        continue
+                    d2 = dx * dx + dy * dy + dz * dz + np.float32(2.0) * max(np.float32(0.0), np.float32(1.0) - cosine)
+                    if instance[w] != instance[v]:
+                        d2 += _OTHER_INSTANCE
+                    d = np.float32(np.sqrt(d2))
+                    k = _NEIGHBOURS
+                    if d < near[k]:
+                        while k > 0 and near[k - 1] > d:
+                            near[k] = near[k - 1]
+                            best[k] = best[k - 1]
+                            k -= 1
+                        near[k] = d
+                        best[k] = row
+        count[v] = 0
+        if near[0] > _ACCEPT:
+            continue
+        limit = min(near[_NEIGHBOURS], _REACH)
+        total = np.float32(0.0)
+        n = 0
+        for k in range(_NEIGHBOURS):
+            if near[k] < limit:
+                w32 = (limit - near[k]) / (limit * max(near[k], np.float32(1e-6)))
+                out_row[v, n] = best[k]
+                out_weight[v, n] = w32 * w32
+                total += w32 * w32
+                n += 1
+        if total > np.float32(0.0):
+            for k in range(n):
+                out_weight[v, k] /= total
+        else:  # five rows equally far
+            n = 1
+            out_row[v, 0] = best[0]
+            out_weight[v, 0] = np.float32(1.0)
+        for k in range(1, n):  # columns ascend
+            row, weight, place = out_row[v, k], out_weight[v, k], k
+            while place > 0 and out_row[v, place - 1] > row:
+                out_row[v, place] = out_row[v, place - 1]
+                out_weight[v, place] = out_weight[v, place - 1]
+                place -= 1
+            out_row[v, place] = row
+            out_weight[v, place] = weight
+        count[v] = n
