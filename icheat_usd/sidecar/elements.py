@@ -249,7 +249,8 @@ def _surface_mask(name: str, mask: SurfaceMask, anchor: str) -> Element:
     n_faces = sum(surface.n_faces for surface in mask.surfaces)
     if texels.ndim != 3 or texels.shape[0] != n_faces or texels.shape[1] != texels.shape[2] or texels.shape[1] < 1:
         raise SidecarError(
-            f"{name}: texels of shape {texels.shape} do not fit {n_faces} faces; expected (faces, resolution, resolution)"
+            f"{name}: texels of shape {texels.shape} do not fit {n_faces} faces; "
+            "expected (faces, resolution, resolution)"
         )
     if texels.dtype != np.float32 or any(surface.n_faces < 0 for surface in mask.surfaces):
         raise SidecarError(f"{name}: texels are {texels.dtype}; expected float32")

@@ -141,7 +141,7 @@ def read_history(file: Source, *, name: str | None = None) -> tuple[History, ...
     where = _names(file, name)
     entries: list[History] = []
     with open_sidecar(file, where) as root, _naming_damage(where):
-        if "history" not in _link_names(root, where):
+        if not root.id.links.exists(b"history"):
             return ()
         history = _child_group(root, "history", where)
         for number in _link_names(history, where):
@@ -213,14 +213,15 @@ def open_sidecar(file: Source, where: str) -> Iterator[h5py.Group]:
 def read_elements(root: h5py.Group, digest: str, where: str, limit_bytes: int) -> dict[str, Element]:
     """All elements of a payload as they are stored, their digest verified."""
     with _naming_damage(where):
-        names = _payload_names(root, where)
-        if digest not in names:
+        payloads = _child_group(root, "payloads", where)
+        if not _DIGEST.fullmatch(digest) or not payloads.id.links.exists(digest.encode()):
+            names = _payload_names(root, where)
             held = ", ".join(name[:12] for name in names[:5]) + (", ..." if len(names) > 5 else "")
             raise SidecarError(
                 f"{where}: there is no payload '{digest[:64]}'; the file holds {held or 'none'}: point icheat:filePath "
                 "to the file that was written with it"
             )
-        payload = _child_group(_child_group(root, "payloads", where), digest, where)
+        payload = _child_group(payloads, digest, where)
         elements: dict[str, Element] = {}
         budget, count = [limit_bytes], [0]
         for name in _link_names(payload, where):
@@ -252,8 +253,6 @@ def _naming_damage(where: str) -> Iterator[None]:
 
 def _payload_names(root: h5py.Group, where: str) -> list[str]:
     with _naming_damage(where):
-        if "payloads" not in _link_names(root, where):
-            return []
         names = _link_names(_child_group(root, "payloads", where), where)
     for name in names:
         if not _DIGEST.fullmatch(name):
@@ -279,7 +278,7 @@ def _child(group: h5py.Group, name: str, where: str) -> Any:
 
 
 def _child_group(group: h5py.Group, name: str, where: str) -> h5py.Group:
-    if name not in _link_names(group, where):
+    if not group.id.links.exists(name.encode()):
         raise SidecarError(f"{where}: there is no group '{name}'; {_RESTORE}")
     child = _child(group, name, where)
     if not isinstance(child, h5py.Group):
