@@ -22,7 +22,8 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from icheat_usd.scene import F64, Finding, Geometry, LightKind, Lights, Materials, Surface, Texture, Textures
-from icheat_usd.stage.shading import Report, resolve_input, time_code
+from icheat_usd.stage.reporting import Reporter
+from icheat_usd.stage.shading import resolve_input, time_code
 from icheat_usd.stage.textures import TextureLibrary
 from icheat_usd.stage.transforms import Placement, from_gf
 
@@ -85,7 +86,7 @@ def read_lights(
     """
     reader = _Reader(time_code(time), placement, textures)
     rows = [row for prim in prims for row in reader.read(prim)]
-    return _table(rows), tuple(row.path for row in rows), reader.report.findings
+    return _table(rows), tuple(row.path for row in rows), list(reader.report.findings())
 
 
 def with_mesh_lights(
@@ -228,7 +229,7 @@ class _Reader:
         self.time = time
         self.placement = placement
         self.textures = textures
-        self.report = Report()
+        self.report = Reporter()
         self.transforms = UsdGeom.XformCache(time)
         self.kinds: dict[str, Callable[[Usd.Prim, F64], _Light | None]] = {
             "SphereLight": self._sphere,
@@ -311,11 +312,10 @@ class _Reader:
         self, prim: Usd.Prim, kind: LightKind, size: tuple[float, float], area: float, texture: int = -1
     ) -> _Light | None:
         if not area > 0.0:
-            self.report.once(
+            self.report(
                 prim.GetPath(),
                 "size",
-                f"{prim.GetPath()} has no area and gives no light; give it a size, or a transform that does not "
-                "flatten it.",
+                "it has no area and gives no light; give it a size, or a transform that does not flatten it.",
             )
             return None
         return self._light(prim, kind, size, self._radiance(prim, area, 1.0), texture)
@@ -338,11 +338,10 @@ class _Reader:
         if size_factor is not None and self._value(prim, "normalize", False):
             radiance /= size_factor
         if not (np.isfinite(radiance).all() and (radiance >= 0.0).all()):
-            self.report.once(
+            self.report(
                 prim.GetPath(),
                 "radiance",
-                f"{prim.GetPath()} has a negative or infinite radiance, which counts as 0; "
-                "check its color, intensity and exposure.",
+                "it has a negative or infinite radiance, which counts as 0; check its color, intensity and exposure.",
             )
             radiance = np.where(np.isfinite(radiance), np.maximum(radiance, 0.0), 0.0)
         return radiance
@@ -373,7 +372,7 @@ class _Reader:
     # Findings -----------------------------------------------------------------------------------
 
     def _unsupported(self, prim: Usd.Prim, feature: str, consequence: str) -> None:
-        self.report.once(prim.GetPath(), feature, f"{prim.GetPath()}: {feature} is not supported; {consequence}.")
+        self.report(prim.GetPath(), feature, f"{feature} is not supported; {consequence}.")
 
     def _report_kind(self, prim: Usd.Prim, kind: str) -> None:
         if prim.IsA(UsdGeom.Mesh):

@@ -17,7 +17,8 @@ import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from icheat_usd.scene import F32, F64, Finding, Materials, Texture
-from icheat_usd.stage.shading import Report, Source, resolve, resolve_input, time_code
+from icheat_usd.stage.reporting import Reporter
+from icheat_usd.stage.shading import Source, resolve, resolve_input, time_code
 from icheat_usd.stage.textures import TextureLibrary
 
 #: What an unauthored diffuseColor, and a mesh without displayColor, reflects.
@@ -106,7 +107,7 @@ class MaterialLibrary:
     def __init__(self, stage: Usd.Stage, time: Usd.TimeCode | float | None) -> None:
         self.stage = stage
         self.time = time_code(time)
-        self.report = Report()
+        self.report = Reporter()
         self.textures = TextureLibrary(self.report)
         self._rows = [_display_color_row()]
         self._row_of: dict[Sdf.Path, int] = {}
@@ -118,7 +119,7 @@ class MaterialLibrary:
 
     @property
     def findings(self) -> list[Finding]:
-        return self.report.findings
+        return list(self.report.findings())
 
     def row(self, material: UsdShade.Material | None, *, prim_path: str) -> int:
         """Row of a bound material.
@@ -200,14 +201,14 @@ class MaterialLibrary:
                 reader(shader, row)
                 return row
         if found:
-            self.report.once(
+            self.report(
                 path,
                 "surface shader",
-                f"{path} has no surface that can be read, only {_describe(found[0])}; displayColor is used. "
+                f"it has no surface that can be read, only {_describe(found[0])}; displayColor is used. "
                 "Give it a UsdPreviewSurface beside it.",
             )
         else:
-            self.report.once(path, "surface", f"{path} has no surface shader; displayColor is used.")
+            self.report(path, "surface", "it has no surface shader; displayColor is used.")
         return _display_color_row(path)
 
     def _read_preview_surface(self, shader: UsdShade.Shader, row: _Row) -> None:
@@ -253,13 +254,11 @@ class MaterialLibrary:
                 self._unsupported(row, name, "it is ignored")
 
     def _unsupported(self, row: _Row, feature: str, consequence: str) -> None:
-        self.report.once(row.path, feature, f"{row.path}: {feature} is not supported; {consequence}.")
+        self.report(row.path, feature, f"{feature} is not supported; {consequence}.")
 
     # Inputs -------------------------------------------------------------------------------------
 
-    def _number(
-        self, shader: UsdShade.Shader, name: str, default: float, column: Texture | None, row: _Row
-    ) -> float:
+    def _number(self, shader: UsdShade.Shader, name: str, default: float, column: Texture | None, row: _Row) -> float:
         return self._input(shader, name, (default,), column, row)[0]
 
     def _color(self, shader: UsdShade.Shader, name: str, default: Color, column: Texture | None, row: _Row) -> Color:
@@ -272,9 +271,7 @@ class MaterialLibrary:
         """Value of an input with as many components as its default; a texture it reads is noted in `row`."""
         source = resolve_input(shader, name, self.time)
         if source.broken:
-            self.report.once(
-                row.path, f"{name} connection", f"{row.path}: {name} is connected to nothing; its own value is used."
-            )
+            self.report(row.path, f"{name} connection", f"{name} is connected to nothing; its own value is used.")
         if source.node is None:
             return _fit(source.value, default, default)
         identifier = str(source.node.GetShaderId() or "")
@@ -285,9 +282,7 @@ class MaterialLibrary:
         self._unsupported(row, name, f"{_describe(source.node)} is connected to it, and the default is used")
         return default
 
-    def _primvar(
-        self, reader: UsdShade.Shader, name: str, default: tuple[float, ...], row: _Row
-    ) -> tuple[float, ...]:
+    def _primvar(self, reader: UsdShade.Shader, name: str, default: tuple[float, ...], row: _Row) -> tuple[float, ...]:
         primvar = str(resolve_input(reader, "varname", self.time).value or "")
         fallback = _fit(resolve_input(reader, "fallback", self.time).value, default, default)
         if name == "diffuseColor" and primvar == "displayColor":
@@ -298,9 +293,7 @@ class MaterialLibrary:
             )
         return fallback
 
-    def _texture(
-        self, source: Source, default: tuple[float, ...], column: Texture, row: _Row
-    ) -> tuple[float, ...]:
+    def _texture(self, source: Source, default: tuple[float, ...], column: Texture, row: _Row) -> tuple[float, ...]:
         node = source.node
         assert node is not None
 
@@ -328,10 +321,10 @@ class MaterialLibrary:
         else:
             transform, st_name = self._texture_coordinates(node, row)
             if row.st_name and st_name != row.st_name:
-                self.report.once(
+                self.report(
                     row.path,
                     "texture coordinates",
-                    f"{row.path} reads texture coordinates '{row.st_name}' and '{st_name}'; "
+                    f"it reads texture coordinates '{row.st_name}' and '{st_name}'; "
                     f"'{row.st_name}' is used for all its textures.",
                 )
             row.st_name = row.st_name or st_name
@@ -354,10 +347,10 @@ class MaterialLibrary:
             if name:
                 return total[:2], name
         reads = _describe(source.node) if source.node else "no primvar reader"
-        self.report.once(
+        self.report(
             row.path,
             "texture coordinates",
-            f"{row.path}: the texture coordinates of {texture.GetPath()} come from {reads}; the primvar 'st' is used.",
+            f"the texture coordinates of {texture.GetPath()} come from {reads}; the primvar 'st' is used.",
         )
         return total[:2], "st"
 
@@ -389,10 +382,10 @@ class MaterialLibrary:
                     continue
                 for target in relationship.GetTargets():
                     if not self.stage.GetPrimAtPath(target):
-                        self.report.once(
+                        self.report(
                             target,
                             "missing material",
-                            f"{target} is bound on {prim.GetPath()} and does not exist; displayColor is used.",
+                            f"it is bound on {prim.GetPath()} and does not exist; displayColor is used.",
                         )
                         return
             prim = prim.GetParent()

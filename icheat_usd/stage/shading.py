@@ -1,13 +1,11 @@
-"""What materials and lights share: findings said once, and values looked up through connections."""
+"""What materials and lights share: values looked up through connections."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from pxr import Usd, UsdShade
-
-from icheat_usd.scene import Finding
 
 
 def time_code(time: Usd.TimeCode | float | None) -> Usd.TimeCode:
@@ -15,21 +13,6 @@ def time_code(time: Usd.TimeCode | float | None) -> Usd.TimeCode:
     if isinstance(time, Usd.TimeCode):
         return time
     return Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
-
-
-@dataclass
-class Report:
-    """Findings in the order they were met, each prim and feature once."""
-
-    findings: list[Finding] = field(default_factory=list)
-    _said: set[tuple[str, str]] = field(default_factory=set)
-
-    def once(self, prim: object, feature: str, message: str) -> None:
-        """Add a finding unless this prim and feature already have one."""
-        key = (str(prim), feature)
-        if key not in self._said:
-            self._said.add(key)
-            self.findings.append(Finding(prim=key[0], feature=feature, message=message))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pxr import Ar, Sdf
 from icheat_usd.errors import ImageError
 from icheat_usd.image.texture import StoredImage, read_texture
 from icheat_usd.scene import F32, Textures
-from icheat_usd.stage.shading import Report
+from icheat_usd.stage.reporting import Reporter
 
 #: UsdUVTexture's wrap tokens as the codes of `Textures.wrap`.
 WRAP = {"repeat": 0, "clamp": 1, "mirror": 2, "black": 3}
@@ -63,13 +63,14 @@ class TextureLibrary:
         Where files that cannot be read are noted.
     """
 
-    def __init__(self, report: Report | None = None) -> None:
-        self.report = Report() if report is None else report
+    def __init__(self, report: Reporter | None = None) -> None:
+        self.report = Reporter() if report is None else report
         self._images: list[F32] = []
         self._file_wrap: list[tuple[str, str]] = []
         self._image_of: dict[tuple[object, ...], int] = {}
         self._rows: list[tuple[int, int, int]] = []  # image, wrap s, wrap t
         self._row_of: dict[tuple[int, int, int], int] = {}
+        self._table: Textures | None = None  # the texels of a scene are worth copying once only
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -123,6 +124,7 @@ class TextureLibrary:
         if row not in self._row_of:
             self._row_of[row] = len(self._rows)
             self._rows.append(row)
+            self._table = None
         return self._row_of[row]
 
     def image(self, row: int) -> F32:
@@ -131,6 +133,11 @@ class TextureLibrary:
 
     def table(self) -> Textures:
         """Everything added so far; rows that differ only in wrapping share their texels."""
+        if self._table is None:
+            self._table = self._join()
+        return self._table
+
+    def _join(self) -> Textures:
         sizes = [image.shape[0] * image.shape[1] for image in self._images]
         first = np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
         images = [row[0] for row in self._rows]
@@ -149,15 +156,15 @@ class TextureLibrary:
         if key in self._image_of:
             return self._image_of[key]
         if not authored:
-            self.report.once(prim_path, "texture file", f"{prim_path} names no texture file; its fallback is used.")
+            self.report(prim_path, "texture file", "it names no texture file; its fallback is used.")
             return -1
         if "<UDIM>" in authored:
-            self.report.once(
+            self.report(
                 prim_path, "udim", f"{authored} is a set of UDIM tiles, which are not supported; the fallback is used."
             )
             return self._remember(key, -1)
         if not resolved:
-            self.report.once(
+            self.report(
                 prim_path,
                 f"texture {authored}",
                 f"the texture file {authored} does not exist; the fallback is used. Restore the file or its path.",
@@ -166,7 +173,7 @@ class TextureLibrary:
         try:
             stored = read_texture(_content(resolved), resolved)
         except ImageError as error:
-            self.report.once(prim_path, f"texture {authored}", f"{error} The fallback is used.")
+            self.report(prim_path, f"texture {authored}", f"{error} The fallback is used.")
             return self._remember(key, -1)
         return self._store(key, to_linear_rgba(stored, color_space), stored.wrap)
 

@@ -63,9 +63,7 @@ PRIMVAR = """
 """
 
 
-def read(
-    stage: Usd.Stage, path: str = "/M", time: float | None = None
-) -> tuple[Materials, int, MaterialLibrary]:
+def read(stage: Usd.Stage, path: str = "/M", time: float | None = None) -> tuple[Materials, int, MaterialLibrary]:
     library = MaterialLibrary(stage, time)
     row = library.row(UsdShade.Material(stage.GetPrimAtPath(path)), prim_path="/mesh")
     return library.tables()[0], row, library
@@ -140,8 +138,7 @@ def test_values_come_through_the_material_interface_and_nested_node_graphs(tmp_p
     stage = write_stage(
         tmp_path,
         surface(
-            "float inputs:roughness.connect = </M.inputs:rough>\n"
-            "float inputs:metallic.connect = </M/G.outputs:m>\n",
+            "float inputs:roughness.connect = </M.inputs:rough>\nfloat inputs:metallic.connect = </M/G.outputs:m>\n",
             'def NodeGraph "G"\n{\n    float inputs:metal.connect = </M.inputs:metal>\n'
             "    float outputs:m.connect = </M/G.inputs:metal>\n}\n",
             "float inputs:rough = 0.75\nfloat inputs:metal = 0.5",
@@ -174,7 +171,7 @@ def test_instances_share_a_row_under_a_scene_path(tmp_path: Path) -> None:
         """
 class "Asset"
 {
-    def Mesh "mesh" ( prepend apiSchemas = ["MaterialBindingAPI"] ) 
+    def Mesh "mesh" ( prepend apiSchemas = ["MaterialBindingAPI"] )
     {
         rel material:binding = </Asset/M>
     }
@@ -189,8 +186,8 @@ class "Asset"
         }
     }
 }
-def "A" ( instanceable = true  inherits = </Asset> ) {}
-def "B" ( instanceable = true  inherits = </Asset> ) {}
+def "A" ( instanceable = true; inherits = </Asset> ) {}
+def "B" ( instanceable = true; inherits = </Asset> ) {}
 """,
     )
     library = MaterialLibrary(stage, None)
@@ -512,7 +509,7 @@ def test_a_readable_surface_in_another_context_wins_over_an_unreadable_universal
         'def Shader "S"',
         'token outputs:mtlx:surface.connect = </M/N.outputs:out>\n    def Shader "N"\n    {\n'
         '        uniform token info:id = "ND_UsdPreviewSurface_surfaceshader"\n'
-        "        color3f inputs:diffuseColor = (0.5, 0, 0)\n        token outputs:out\n    }\n    def Shader \"S\"",
+        '        color3f inputs:diffuseColor = (0.5, 0, 0)\n        token outputs:out\n    }\n    def Shader "S"',
     )
     table, row, library = read(write_stage(tmp_path, body))
     np.testing.assert_array_equal(table.diffuse[row], [0.5, 0, 0])
