@@ -112,9 +112,7 @@ def image_size(
     return width, height if height is not None else max(1, round(width / aspect))
 
 
-def conform(
-    window: tuple[float, float, float, float], aspect: float, policy: str
-) -> tuple[float, float, float, float]:
+def conform(window: tuple[float, float, float, float], aspect: float, policy: str) -> tuple[float, float, float, float]:
     """Fit a window (left, right, bottom, top) to the image's aspect about its own centre, by USD's policy.
 
     Raises

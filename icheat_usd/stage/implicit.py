@@ -48,7 +48,8 @@ def display_color(prim: Usd.Prim, time: Usd.TimeCode, report: Reporter) -> tuple
     if not values:
         return (DEFAULT_COLOR, DEFAULT_COLOR, DEFAULT_COLOR)
     if len(values) > 1:
-        report(prim, "primvar displayColor", f"{prim.GetTypeName()} takes one displayColor; the first of {len(values)} is used.")
+        kind = prim.GetTypeName()
+        report(prim, "primvar displayColor", f"a {kind} takes one displayColor; the first of {len(values)} is used.")
     return (float(values[0][0]), float(values[0][1]), float(values[0][2]))
 
 
@@ -61,8 +62,8 @@ def read_implicit(
 ) -> TriangleMesh | None:
     """Triangles of an implicit shape, or None with a finding where its parameters make none."""
     kind, size, radius, height, top, bottom, width, length, axis, double_sided, orientation = shape_parameters
-    numbers = [value for value in (size, radius, height, top, bottom, width, length) if value is not None]
-    if not np.isfinite(np.array(numbers, dtype=np.float64)).all() or (numbers and min(numbers) < 0.0):  # type: ignore[type-var]
+    numbers = np.array([_number(value) for value in (size, radius, height, top, bottom, width, length)])
+    if not np.isfinite(numbers).all() or numbers.min() < 0.0:
         report(prim, "implicit shape", f"a size of this {kind} is negative or not finite; left out.")
         return None
     order = _AXES.get(str(axis), _AXES["Z"])
@@ -92,7 +93,7 @@ def read_implicit(
         points=triangles.astype(np.float32),
         normals=unit_normals(normals[corners], triangles),
         st=st[corners].astype(np.float32),
-        color=np.broadcast_to(np.float32(color), triangles.shape).copy(),
+        color=np.broadcast_to(np.array(color, np.float32), triangles.shape).copy(),
         face=face.astype(np.int32),
         face_uv=face_parametrisation(counts)[corners].astype(np.float32),
         material=np.full(len(face), materials.row, np.int32),

@@ -68,7 +68,8 @@ class InstancerReader:
         self._report_per_instance_color(prim)
         shown = self._mask(instancer, time, len(which))
         ids = self._ids(instancer, time, len(which))
-        prototypes = [prim.GetStage().GetPrimAtPath(path) for path in instancer.GetPrototypesRel().GetForwardedTargets()]
+        targets = instancer.GetPrototypesRel().GetForwardedTargets()
+        prototypes = [prim.GetStage().GetPrimAtPath(target) for target in targets]
         if which.min() < 0 or which.max() >= len(prototypes):
             self._report(
                 prim,
@@ -120,7 +121,7 @@ class InstancerReader:
             return np.arange(n)
         if len(ids) != n or len(np.unique(ids)) != n:
             self._report(
-                instancer.GetPrim(), "ids", f"ids are not {n} different numbers; instances are numbered in order instead."
+                instancer.GetPrim(), "ids", f"ids are not {n} different numbers; instances are numbered in order."
             )
             return np.arange(n)
         return ids

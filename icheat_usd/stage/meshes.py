@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,12 @@ def topology_digest(counts: NDArray[np.integer], indices: NDArray[np.integer]) -
 
 
 def read_mesh(
-    mesh: UsdGeom.Mesh, time: Usd.TimeCode, materials: FaceMaterials, level: int, report: Reporter
+    mesh: UsdGeom.Mesh,
+    time: Usd.TimeCode,
+    materials: FaceMaterials,
+    level: int,
+    report: Reporter,
+    known: dict[bytes, TriangleMesh | None] | None = None,
 ) -> TriangleMesh | None:
     """Triangles of a mesh at one time, or None with a finding where its data cannot be used.
 
@@ -90,70 +95,101 @@ def read_mesh(
         Subdivision steps for ``catmullClark`` and ``bilinear`` meshes.
     report
         Receives what is wrong or not supported.
+    known
+        Meshes built so far by the digest of their data: equal prims are refined once.
     """
-    prim = mesh.GetPrim()
-    control = _read_control_mesh(mesh, time, report)
+    control = _read_control_mesh(mesh, time, materials, level, report)
     if control is None:
         return None
-    points, counts, indices, face = control
-    authored = Topology(len(points), counts, indices)
-    digest = topology_digest(counts, indices)
-    n_faces = len(counts)
+    key = control.digest()
+    known = {} if known is None else known
+    if key not in known:
+        known[key] = _build(control)
+    built = known[key]
+    if built is None:
+        report(mesh.GetPrim(), "mesh", "it has no face with an area; left out.")
+        return None
+    # The same triangles with other materials are shared too, where two prims ask for the same ones.
+    with_rows = key + control.rows.tobytes()
+    if with_rows not in known:
+        rows = control.rows[built.face]
+        known[with_rows] = built if np.array_equal(rows, built.material) else replace(built, material=rows)
+    return known[with_rows]
 
-    scheme = str(mesh.GetSubdivisionSchemeAttr().Get(time) or "catmullClark")
-    if scheme == "loop":
-        report(prim, "subdivisionScheme loop", "Loop subdivision is not supported; the control mesh is used, smoothed.")
-    elif scheme not in ("none", "catmullClark", "bilinear"):
-        report(prim, "subdivisionScheme", f"'{scheme}' is no subdivision scheme; the mesh is taken as polygons.")
-        scheme = "none"
 
-    # Columns that ride along: on vertices behind the position, on corners behind the place in the face.
-    rows = materials.rows(n_faces)
-    used_rows = np.unique(rows) if n_faces else np.array([materials.row])
-    names = sorted({materials.st_name(int(row)) for row in used_rows})
-    columns = {name: _read_values(prim, name, 2, time, authored, report) for name in names}
-    columns["displayColor"] = _read_values(prim, "displayColor", 3, time, authored, report)
-    if scheme == "none":
-        columns["normals"] = _read_normals(mesh, time, authored, report)
+@dataclass(frozen=True)
+class _ControlMesh:
+    """All that decides the triangles of a mesh."""
 
-    vertex_columns, corner_columns = [points], [face_parametrisation(counts)]
+    points: F64
+    counts: I64
+    indices: I64
+    scheme: str
+    level: int
+    sharp_corners: bool
+    left_handed: bool
+    double_sided: bool
+    shown: NDArray[np.bool_]  #: (n_faces,) False for holes
+    columns: dict[str, MeshValues]  #: "displayColor", "normals", and texture coordinates as "st 0", "st 1", ...
+    st_column: I32  #: (n_faces,) which of the texture coordinates a face takes
+    rows: I32  #: (n_faces,) material rows, which do not shape the triangles
+
+    @property
+    def n_faces(self) -> int:
+        return len(self.counts)
+
+    def digest(self) -> bytes:
+        digest = hashlib.blake2b(digest_size=32)
+        flags = (self.scheme, self.level, self.sharp_corners, self.left_handed, self.double_sided)
+        digest.update(
+            repr((flags, [(name, c.on_vertices, c.values.shape) for name, c in self.columns.items()])).encode()
+        )
+        arrays = [self.points, self.counts, self.indices, self.shown, self.st_column]
+        for array in (*arrays, *(column.values for column in self.columns.values())):
+            # What was broadcast from one value is hashed as one.
+            data = array[:1] if array.ndim == 2 and array.strides[0] == 0 else array
+            digest.update(repr(array.shape).encode())
+            digest.update(np.ascontiguousarray(data).data)
+        return digest.digest()
+
+
+def _build(control: _ControlMesh) -> TriangleMesh | None:
+    # Columns ride along: on vertices behind the position, on corners behind the place in the face.
+    vertex_columns, corner_columns = [control.points], [face_parametrisation(control.counts)]
     places: dict[str, tuple[bool, int, int]] = {}
-    for name, column in columns.items():
-        if column is None:
-            continue
+    for name, column in control.columns.items():
         target = vertex_columns if column.on_vertices else corner_columns
         begin = sum(part.shape[1] for part in target)
         places[name] = (column.on_vertices, begin, begin + column.values.shape[1])
         target.append(column.values)
-
-    cage = Cage(np.concatenate(vertex_columns, axis=1), counts, indices, np.concatenate(corner_columns, axis=1), face)
-    kept = _visible_faces(mesh, time, cage, report)
-    if scheme in ("catmullClark", "bilinear"):
-        sharp = str(mesh.GetInterpolateBoundaryAttr().Get(time)) != "edgeOnly"
-        if scheme == "catmullClark":
-            _report_creases(mesh, time, report)
-        cage = refine(
-            _only(cage, counts >= 3),
-            _affordable_level(int(counts.sum()), level, prim, report),
-            smooth=scheme == "catmullClark",
-            sharp_corners=sharp,
-        )
-    smooth = scheme in ("catmullClark", "loop")
-    vertex_normals = _smooth_normals(cage) if smooth else None
-    cage = _only(cage, kept[cage.face])
+    cage = Cage(
+        np.concatenate(vertex_columns, axis=1),
+        control.counts,
+        control.indices,
+        np.concatenate(corner_columns, axis=1),
+        np.arange(control.n_faces),
+    )
+    cage = _only(cage, control.counts >= 3)
+    if not len(cage.counts):
+        return None
+    if control.scheme in ("catmullClark", "bilinear"):
+        cage = refine(cage, control.level, smooth=control.scheme == "catmullClark", sharp_corners=control.sharp_corners)
+    vertex_normals = _smooth_normals(cage) if control.scheme in ("catmullClark", "loop") else None
+    cage = _only(cage, control.shown[cage.face])
+    if not len(cage.counts):
+        return None
 
     # Triangles -----------------------------------------------------------
     origin = _origin(cage.vertices[:, :3])
     positions = cage.vertices[:, :3] - origin
     corners, triangle_face = triangulate(positions, cage.counts, cage.indices)
-    if str(mesh.GetOrientationAttr().Get(time)) == "leftHanded":
+    if control.left_handed:
         corners = corners[:, [0, 2, 1]]
         vertex_normals = None if vertex_normals is None else -vertex_normals
     vertex = cage.indices[corners]
     triangles = positions[vertex]
     good = ~degenerate(triangles)
     if not good.any():
-        report(prim, "mesh", "it has no face with an area; left out.")
         return None
     if not good.all():
         corners, triangle_face, vertex, triangles = corners[good], triangle_face[good], vertex[good], triangles[good]
@@ -165,12 +201,11 @@ def read_mesh(
         on_vertices, begin, end = places[name]
         return cage.vertices[vertex, begin:end] if on_vertices else cage.corners[corners, begin:end]
 
-    row_of_triangle = rows[control_face]
     st = np.zeros((len(triangles), 3, 2), np.float32)
-    for row in used_rows:
-        values = gather(materials.st_name(int(row)))
+    for which in np.unique(control.st_column):
+        values = gather(f"st {which}")
         if values is not None:
-            chosen = row_of_triangle == row
+            chosen = control.st_column[control_face] == which
             st[chosen] = values[chosen]
     color = gather("displayColor")
     normals = vertex_normals[vertex] if vertex_normals is not None else gather("normals")
@@ -181,10 +216,10 @@ def read_mesh(
         color=np.full((len(triangles), 3, 3), DEFAULT_COLOR, np.float32) if color is None else color.astype(np.float32),
         face=control_face.astype(np.int32),
         face_uv=np.clip(cage.corners[corners, :2], 0.0, 1.0).astype(np.float32),
-        material=row_of_triangle,
-        double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
-        n_faces=n_faces,
-        topology_digest=digest,
+        material=control.rows[control_face],
+        double_sided=control.double_sided,
+        n_faces=control.n_faces,
+        topology_digest=topology_digest(control.counts, control.indices),
         origin=origin,
     )
 
@@ -202,8 +237,50 @@ def unit_normals(normals: F64 | None, triangles: F64) -> F32:
 
 
 def _read_control_mesh(
-    mesh: UsdGeom.Mesh, time: Usd.TimeCode, report: Reporter
-) -> tuple[F64, I64, I64, I64] | None:
+    mesh: UsdGeom.Mesh, time: Usd.TimeCode, materials: FaceMaterials, level: int, report: Reporter
+) -> _ControlMesh | None:
+    prim = mesh.GetPrim()
+    topology = _read_topology(mesh, time, report)
+    if topology is None:
+        return None
+    points, counts, indices = topology
+    scheme = str(mesh.GetSubdivisionSchemeAttr().Get(time) or "catmullClark")
+    if scheme == "loop":
+        report(prim, "subdivisionScheme loop", "Loop subdivision is not supported; the control mesh is used, smoothed.")
+    elif scheme not in ("none", "catmullClark", "bilinear"):
+        report(prim, "subdivisionScheme", f"'{scheme}' is no subdivision scheme; the mesh is taken as polygons.")
+        scheme = "none"
+    if scheme == "catmullClark":
+        _report_creases(mesh, time, report)
+    refined = scheme in ("catmullClark", "bilinear")
+
+    sizes = Topology(len(points), counts, indices)
+    rows = materials.rows(len(counts))
+    names = sorted({materials.st_name(int(row)) for row in np.unique(rows)})
+    wanted = [(f"st {which}", _read_values(prim, name, 2, time, sizes, report)) for which, name in enumerate(names)]
+    wanted.append(("displayColor", _read_values(prim, "displayColor", 3, time, sizes, report)))
+    if scheme == "none":
+        wanted.append(("normals", _read_normals(mesh, time, sizes, report)))
+    st_column = np.zeros(len(counts), np.int32)
+    for row in np.unique(rows):
+        st_column[rows == row] = names.index(materials.st_name(int(row)))
+    return _ControlMesh(
+        points=points,
+        counts=counts,
+        indices=indices,
+        scheme=scheme,
+        level=_affordable_level(len(indices), level, prim, report) if refined else 0,
+        sharp_corners=str(mesh.GetInterpolateBoundaryAttr().Get(time)) != "edgeOnly",
+        left_handed=str(mesh.GetOrientationAttr().Get(time)) == "leftHanded",
+        double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
+        shown=_shown_faces(mesh, time, len(counts), report),
+        columns={name: column for name, column in wanted if column is not None},
+        st_column=st_column,
+        rows=rows,
+    )
+
+
+def _read_topology(mesh: UsdGeom.Mesh, time: Usd.TimeCode, report: Reporter) -> tuple[F64, I64, I64] | None:
     prim = mesh.GetPrim()
     points = np.array(mesh.GetPointsAttr().Get(time) or (), dtype=np.float64).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or (), dtype=np.int64)
@@ -221,12 +298,13 @@ def _read_control_mesh(
     if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
         report(prim, "mesh", f"faceVertexIndices reach outside its {len(points)} points; left out.")
         return None
-    if not np.isfinite(points).all():
-        if not np.isfinite(points[indices]).all():
+    finite = np.isfinite(points)
+    if not finite.all():
+        if not finite[indices].all():
             report(prim, "mesh", "a point is not finite (NaN or infinity); left out.")
             return None
-        points = np.where(np.isfinite(points), points, 0.0)
-    return points, counts, indices, np.arange(len(counts))
+        points = np.where(finite, points, 0.0)
+    return points, counts, indices
 
 
 def _read_values(
@@ -236,9 +314,7 @@ def _read_values(
     return None if primvar is None else read_primvar(primvar, time, topology, width, report, prim)
 
 
-def _read_normals(
-    mesh: UsdGeom.Mesh, time: Usd.TimeCode, topology: Topology, report: Reporter
-) -> MeshValues | None:
+def _read_normals(mesh: UsdGeom.Mesh, time: Usd.TimeCode, topology: Topology, report: Reporter) -> MeshValues | None:
     prim = mesh.GetPrim()
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
     if primvar and primvar.HasAuthoredValue():
@@ -246,20 +322,18 @@ def _read_normals(
     attribute = mesh.GetNormalsAttr()
     if not attribute.HasAuthoredValue():
         return None
-    return expand(
-        attribute.Get(time), None, str(mesh.GetNormalsInterpolation()), topology, 3, "normals", report, prim
-    )
+    return expand(attribute.Get(time), None, str(mesh.GetNormalsInterpolation()), topology, 3, "normals", report, prim)
 
 
-def _visible_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode, cage: Cage, report: Reporter) -> NDArray[np.bool_]:
-    kept = np.ones(len(cage.counts), np.bool_)
+def _shown_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode, n_faces: int, report: Reporter) -> NDArray[np.bool_]:
+    shown = np.ones(n_faces, np.bool_)
     holes = np.array(mesh.GetHoleIndicesAttr().Get(time) or (), dtype=np.int64)
     if holes.size:
-        inside = (holes >= 0) & (holes < len(kept))
+        inside = (holes >= 0) & (holes < n_faces)
         if not inside.all():
             report(mesh.GetPrim(), "holeIndices", "some name no face of the mesh; those are ignored.")
-        kept[holes[inside]] = False
-    return kept
+        shown[holes[inside]] = False
+    return shown
 
 
 def _report_creases(mesh: UsdGeom.Mesh, time: Usd.TimeCode, report: Reporter) -> None:
@@ -284,9 +358,7 @@ def _only(cage: Cage, kept: NDArray[np.bool_]) -> Cage:
     if kept.all():
         return cage
     corners = np.repeat(kept, cage.counts)
-    return Cage(
-        cage.vertices, cage.counts[kept], cage.indices[corners], cage.corners[corners], cage.face[kept]
-    )
+    return Cage(cage.vertices, cage.counts[kept], cage.indices[corners], cage.corners[corners], cage.face[kept])
 
 
 def _smooth_normals(cage: Cage) -> F64:

@@ -46,7 +46,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         raise StageError(f"{name} is a folder; give the stage's root layer, a .usd, .usda, .usdc or .usdz file.")
     with quiet_usd():
         if not os.path.exists(name) and not Ar.GetResolver().Resolve(name):
-            raise StageError(f"{name} does not exist; give a .usd, .usda, .usdc or .usdz file, or check the search path.")
+            raise StageError(f"{name} does not exist; give a .usd, .usda, .usdc or .usdz file, or check its path.")
         if not Sdf.FileFormat.FindByExtension(name):
             raise StageError(
                 f"{name} is not a USD file (its extension is '{Path(name).suffix}'); "
@@ -55,7 +55,8 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         try:
             return Usd.Stage.Open(name)
         except Tf.ErrorException as error:
-            raise StageError(f"{name} cannot be read as USD ({_first_reason(error)}); check or export it again.") from None
+            reason = _first_reason(error)
+            raise StageError(f"{name} cannot be read as USD ({reason}); check or export it again.") from None
 
 
 def composition_findings(stage: Usd.Stage) -> tuple[Finding, ...]:
@@ -70,7 +71,7 @@ def composition_findings(stage: Usd.Stage) -> tuple[Finding, ...]:
         first_prim, first_text, count = grouped.get(key, (prim, text, 0))
         grouped[key] = (first_prim, first_text, count + 1)
     return tuple(
-        Finding(prim, f"composition: {kind}", text + (f" And {count - 1} more prims with the same asset." if count > 1 else ""))
+        Finding(prim, f"composition: {kind}", text + (f" And {count - 1} more times." if count > 1 else ""))
         for (kind, _), (prim, text, count) in grouped.items()
     )
 

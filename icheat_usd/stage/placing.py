@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from icheat_usd.stage.meshes import FaceMaterials, TriangleMesh, read_mesh
 from icheat_usd.stage.primvars import find_primvar
 from icheat_usd.stage.reporting import Reporter
 from icheat_usd.stage.transforms import Placement, inverse
+
+Scalar = TypeVar("Scalar", np.float32, np.int32)
 
 
 class GeometryBuilder:
@@ -55,6 +58,8 @@ class GeometryBuilder:
         self.meshes: list[TriangleMesh] = []
         self.surfaces: list[Surface] = []
         self._mesh_of: dict[tuple[object, ...], int | None] = {}
+        self._row_of_mesh: dict[int, int] = {}  # by identity: `meshes` keeps them alive
+        self._known: dict[bytes, TriangleMesh | None] = {}
         self._instance_mesh: list[NDArray[np.int64]] = []
         self._transforms: list[F64] = []
 
@@ -112,7 +117,7 @@ class GeometryBuilder:
                 self.report(prim, "skinning", "skinning is not supported; its points are used at rest.")
             if prim.GetAttribute("skel:blendShapes").HasAuthoredValue():
                 self.report(prim, "blend shapes", "blend shapes are not supported; its points are used at rest.")
-            mesh = read_mesh(UsdGeom.Mesh(prim), self.time, materials, self.level, self.report)
+            mesh = read_mesh(UsdGeom.Mesh(prim), self.time, materials, self.level, self.report, self._known)
         else:
             shape = implicit.parameters(prim, self.time)
             color = implicit.display_color(prim, self.time, self.report)
@@ -120,9 +125,11 @@ class GeometryBuilder:
             if key in self._mesh_of:
                 return self._mesh_of[key]
             mesh = implicit.read_implicit(shape, color, materials, prim, self.report)
-        row = None if mesh is None else len(self.meshes)
+        row = None
         if mesh is not None:
-            self.meshes.append(mesh)
+            row = self._row_of_mesh.setdefault(id(mesh), len(self.meshes))
+            if row == len(self.meshes):
+                self.meshes.append(mesh)
         self._mesh_of[key] = row
         return row
 
@@ -158,7 +165,7 @@ class GeometryBuilder:
             Row-vector local-to-world matrices in stage units.
         names : k of (path, id, part)
         """
-        finite = np.isfinite(matrices).all(axis=(1, 2))
+        finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
         if not finite.all():
             self.report(names[int(np.argmin(finite))][0], "transform", "a transform is not finite; left out there.")
         # Scaled to nothing is a usual way to hide; it has no area.
@@ -211,7 +218,7 @@ class GeometryBuilder:
         to_world = placement.place(self._all_transforms())
         counts = [len(mesh.points) for mesh in meshes]
 
-        def join(name: str, shape: tuple[int, ...], kind: type[np.generic]) -> NDArray[np.generic]:
+        def join(name: str, shape: tuple[int, ...], kind: type[Scalar]) -> NDArray[Scalar]:
             parts = [getattr(mesh, name) for mesh in meshes] or [np.empty((0, *shape))]
             return np.ascontiguousarray(np.concatenate(parts), dtype=kind)
 

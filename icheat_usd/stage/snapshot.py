@@ -72,7 +72,8 @@ def take_snapshot(
     report = Reporter()
     with quiet_usd():
         choices = read_render_choices(stage, when)
-        camera_prim = None if camera == AUTO_CAMERA else find_camera(stage, None if camera is None else str(camera), choices)
+        wanted = None if camera is None else str(camera)
+        camera_prim = None if wanted == AUTO_CAMERA else find_camera(stage, wanted, choices)
         report.extend(composition_findings(stage))
 
         progress("reading the stage", 0.0)
@@ -103,7 +104,7 @@ def take_snapshot(
         lights, light_paths, light_findings = read_lights(lights_shown, when, placement, materials.textures)
         tables, material_paths = materials.tables()
         lights, light_paths = with_mesh_lights(
-            lights, light_paths, geometry, builder.surfaces, tables, material_paths
+            lights, light_paths, geometry, builder.surfaces, tables, materials.textures.table()
         )
         report.extend(materials.findings)
         report.extend(light_findings)
