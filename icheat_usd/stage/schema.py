@@ -39,7 +39,6 @@ STACK_ENABLED = "icheat:stackEnabled"
 EDITS = "icheat:edits"
 CAMERA = "icheat:camera"
 
-#: Types whose values `to_value` understands; a third party's parameter of another type is left out.
 _PREFIX = "icheat:"
 
 
@@ -160,10 +159,8 @@ def _registry_operations() -> MappingProxyType[str, OperationSchema]:
         for property_name in names:
             attribute = definition.GetAttributeDefinition(property_name)
             if attribute:
-                doc = (attribute.GetMetadata("customData") or {}).get("userDocBrief", "")
-                properties.append(
-                    PropertySchema(property_name, attribute.GetTypeName(), attribute.GetFallbackValue(), doc)
-                )
+                # No sentence: USD drops a schema's documentation when it composes definitions.
+                properties.append(PropertySchema(property_name, attribute.GetTypeName(), attribute.GetFallbackValue()))
         operation = _as_operation(name, properties)
         if operation:
             found[operation.name] = operation
