@@ -329,8 +329,7 @@ class MaterialLibrary:
                 )
             row.st_name = row.st_name or st_name
             row.textures[column] = _Image(texture, channel, transform, scale, bias)
-            mean = self.textures.image(texture).mean(axis=(0, 1), dtype=np.float64)
-            rgba = mean * np.array(scale) + np.array(bias)
+            rgba = self.textures.mean(texture) * np.array(scale) + np.array(bias)
         if channel >= 0:
             return (float(rgba[channel]),) * len(default)
         return tuple(float(x) for x in rgba[:3])

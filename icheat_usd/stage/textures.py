@@ -9,7 +9,7 @@ from pxr import Ar, Sdf
 
 from icheat_usd.errors import ImageError
 from icheat_usd.image.texture import StoredImage, read_texture
-from icheat_usd.scene import F32, Textures
+from icheat_usd.scene import F32, F64, Textures
 from icheat_usd.stage.reporting import Reporter
 
 #: UsdUVTexture's wrap tokens as the codes of `Textures.wrap`.
@@ -47,10 +47,13 @@ def to_linear_rgba(image: StoredImage, color_space: str) -> F32:
     if color_space == "sRGB" or (color_space != "raw" and automatic):
         if image.is_8bit:
             lookup = decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255.0))
-            rgba[..., :3] = lookup[np.rint(rgba[..., :3] * 255.0).astype(np.uint8)]
+            for channel in range(3):
+                codes = rgba[..., channel] * np.float32(255.0) + np.float32(0.5)  # truncation below then rounds
+                rgba[..., channel] = lookup[codes.astype(np.uint8)]
         else:
             rgba[..., :3] = decode_srgb(rgba[..., :3])
-    np.nan_to_num(rgba, copy=False, nan=0.0, posinf=LARGEST, neginf=-LARGEST)
+    if not image.is_8bit:
+        np.nan_to_num(rgba, copy=False, nan=0.0, posinf=LARGEST, neginf=-LARGEST)
     return rgba
 
 
@@ -66,6 +69,7 @@ class TextureLibrary:
     def __init__(self, report: Reporter | None = None) -> None:
         self.report = Reporter() if report is None else report
         self._images: list[F32] = []
+        self._means: dict[int, F64] = {}
         self._file_wrap: list[tuple[str, str]] = []
         self._image_of: dict[tuple[object, ...], int] = {}
         self._rows: list[tuple[int, int, int]] = []  # image, wrap s, wrap t
@@ -127,9 +131,13 @@ class TextureLibrary:
             self._table = None
         return self._row_of[row]
 
-    def image(self, row: int) -> F32:
-        """Texels of a row as ``(height, width, 4) float32``, linear RGBA, row 0 on top."""
-        return self._images[self._rows[row][0]]
+    def mean(self, row: int) -> F64:
+        """Mean texel of a row as ``(4,) float64``, linear RGBA."""
+        image = self._rows[row][0]
+        if image not in self._means:
+            # Row by row, so that no double-precision copy of the image is made.
+            self._means[image] = self._images[image].mean(axis=1).mean(axis=0, dtype=np.float64)
+        return self._means[image]
 
     def table(self) -> Textures:
         """Everything added so far; rows that differ only in wrapping share their texels."""

@@ -57,6 +57,7 @@ def test_other_formats_keep_a_constant_colour(tmp_path: Path, extension: str, to
     color = np.array([0.75, 0.25, 0.5], np.float32)
     path = tmp_path / f"a.{extension}"
     output = oiio.ImageOutput.create(str(path))
+    assert output is not None
     assert output.open(str(path), oiio.ImageSpec(16, 8, 3, "uint8" if is_8bit else "float"))
     assert output.write_image(np.broadcast_to(color, (8, 16, 3)).copy())
     output.close()
@@ -79,6 +80,7 @@ def test_wrap_modes_that_a_file_asks_for_are_handed_on(tmp_path: Path) -> None:
     spec.attribute("wrapmodes", "periodic,mirror")
     path = tmp_path / "a.tif"
     output = oiio.ImageOutput.create(str(path))
+    assert output is not None
     assert output.open(str(path), spec)
     assert output.write_image(np.zeros((4, 4, 3), np.float32))
     output.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ def test_each_kind_has_its_sizes_and_the_fallback_intensity_of_its_schema(tmp_pa
     assert paths == tuple(f"/{k}" for k in kinds)
     assert lights.kind.tolist() == [0, 1, 2, 3, 4, 5, 5]
     half_angle = math.radians(0.53) / 2
-    sizes = [[0.5, 0], [0.5, 0], [1, 1], [0.5, 1], [half_angle, 0], [0, 0], [0, 0]]
+    sizes = np.array([[0.5, 0], [0.5, 0], [1, 1], [0.5, 1], [half_angle, 0], [0, 0], [0, 0]])
     np.testing.assert_allclose(lights.size, sizes, rtol=1e-6)
     np.testing.assert_allclose(lights.radiance, np.array([[1, 1, 1, 1, 50000, 1, 1]] * 3).T)
     assert (lights.texture == -1).all() and (lights.surface == -1).all()
@@ -370,7 +371,8 @@ def two_meshes() -> Geometry:
 def three_materials(folder: Path, emission_texel: tuple[int, int, int]) -> tuple[Materials, Textures]:
     """Row 0 dark, row 1 with emissive colour, row 2 with an emissive texture of one texel."""
     library = MaterialLibrary(write_stage(folder, ""), None)
-    materials = Materials(*(np.repeat(column, 3, axis=0) for column in library.tables()[0]))
+    columns: list[Any] = [np.repeat(column, 3, axis=0) for column in library.tables()[0]]
+    materials = Materials(*columns)
     materials.emission[1] = [0.0, 3.0, 0.0]
     (folder / "glow.png").write_bytes(encode_png(np.array([[emission_texel]], np.uint8)))
     materials.texture[2, Texture.EMISSION] = library.textures.add(str(folder / "glow.png"), "raw")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from pxr import Usd, UsdGeom, UsdShade, UsdUtils
 
 from icheat_usd.scene import Materials, Texture
 from icheat_usd.stage.materials import MaterialLibrary
+from icheat_usd.stage.textures import TextureLibrary
 from tests.images import encode_png
 
 
@@ -82,7 +84,7 @@ def test_unauthored_inputs_have_the_fallbacks_of_the_shader_definition(tmp_path:
     table, row, library = read(write_stage(tmp_path, surface("")))
     node = Sdr.Registry().GetShaderNodeByIdentifier("UsdPreviewSurface")
 
-    def default(name: str) -> object:
+    def default(name: str) -> Any:
         return node.GetShaderInput(name).GetDefaultValue()
 
     np.testing.assert_allclose(table.diffuse[row], list(default("diffuseColor")))
@@ -265,6 +267,23 @@ def test_the_colour_space_decides_what_is_decoded_and_never_alpha(
     stored = (full // 5) / full
     np.testing.assert_allclose(texel[:3], linear(stored) if decoded else stored, rtol=1e-4)
     assert texel[3] == pytest.approx(stored if channels == 4 else 1.0, rel=1e-4)
+
+
+def test_every_8_bit_code_is_decoded_to_its_own_value(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(encode_png(np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)))
+    library = TextureLibrary()
+    library.add(str(tmp_path / "a.png"))
+    np.testing.assert_allclose(library.table().texels[:, 0], [linear(k / 255.0) for k in range(256)], rtol=2e-6)
+
+
+def test_texels_that_are_not_finite_are_made_so(tmp_path: Path) -> None:
+    import OpenEXR
+
+    rgb = np.array([[[np.nan, np.inf, -np.inf], [1.0, 2.0, 3.0]]], np.float32)
+    OpenEXR.File({}, {"RGB": rgb}).write(str(tmp_path / "a.exr"))
+    library = TextureLibrary()
+    library.add(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(library.table().texels, [[0, 65504, -65504, 1], [1, 2, 3, 1]])
 
 
 def test_one_file_read_for_several_inputs_is_stored_once(tmp_path: Path) -> None:
