@@ -35,11 +35,11 @@ def build(folder: Path) -> None:
     b.material("Trousers", (0.42, 0.38, 0.32))
     b.material("Shoes", (0.5, 0.5, 0.48))
 
-    left, right, back, front, top = -2.2, 2.2, -1.8, 2.8, 2.6
+    left, right, back, front, top = -2.2, 2.2, -1.8, 3.6, 2.6
     room = b.component("Room")
     b.mesh(
         f"{room}/Floor",
-        quad([(left, 0, front), (right, 0, front), (right, 0, back), (left, 0, back)], (4.4 / 1.2, 4.6 / 1.2)),
+        quad([(left, 0, front), (right, 0, front), (right, 0, back), (left, 0, back)], (4.4 / 1.2, 5.4 / 1.2)),
         "Floor",
     )
     b.mesh(
@@ -85,8 +85,8 @@ def build(folder: Path) -> None:
     add_figure(b, person, Looks("Skin", "Hair", "Shirt", "Trousers", "Shoes"), Pose(swing))
 
     # High on the right wall, tilted down: a window's worth of light that lands on floor and left wall.
-    b.rect_light("/World/Lights/Window", (1.6, 1.0), (11.0, 10.2, 9.0), (2.15, 1.85, 0.6), (-25, 90, 0))
-    main = b.camera("Main", (-0.35, 1.35, 2.7), (0.08, 0.82, -0.9), 62)
+    b.rect_light("/World/Lights/Window", (1.6, 1.0), (26.0, 24.0, 21.0), (1.95, 1.85, 0.9), (-25, 90, 0))
+    main = b.camera("Main", (0.0, 1.45, 3.4), (0.0, 0.86, -0.9), 52)
     b.render_settings(main)
     b.save(folder / "scene.usda")
 
@@ -99,7 +99,7 @@ def _every(curve):  # type: ignore[no-untyped-def]
 
 def _ball(frame: float) -> tuple[float, float, float]:
     """Three bounces along +x, each lower, the last one into the basket."""
-    x = -1.45 + 2.05 * (frame - 1) / 42
+    x = -1.3 + 1.9 * (frame - 1) / 42
     bounces = ((-9.0, 13.0, 1.15), (13.0, 28.0, 0.72), (28.0, 43.0, 0.66))
     for start, end, height in bounces:
         if frame <= end:

@@ -14,7 +14,7 @@ FRAMES = None
 DOC = """A furnished room, 5.2 x 5 m. Sunlight through a window outside the left edge of the picture falls on the rug and
 the low table; the person beside it stands in the shade and is lit by what the rug and floor send on, so a lighter who
 wants the face warmer, or less red from the rug, has no light to turn.
-Variant set "sky" on /World: "rect" is a RectLight in the window, "dome" a textured sky that is seen through it."""
+Variant set "sky" on /World: "rect" is a RectLight before the window, "dome" a textured sky that is seen through it."""
 
 
 def build(folder: Path) -> None:
@@ -33,7 +33,7 @@ def build(folder: Path) -> None:
     b.material("Wood", (0.27, 0.15, 0.08), texture="./textures/wood.png", roughness=0.4, ior=1.5)
     b.material("Rug", (0.5, 0.1, 0.06), texture="./textures/rug.png")
     b.material("Painting", (0.4, 0.35, 0.3), texture="./textures/painting.png")
-    b.material("Sofa", (0.07, 0.21, 0.24))
+    b.material("Sofa", (0.11, 0.30, 0.33))
     b.material("Mustard", (0.62, 0.38, 0.06))
     b.material("Rust", (0.50, 0.15, 0.06))
     b.material("Linen", (0.66, 0.62, 0.55))
@@ -57,10 +57,11 @@ def build(folder: Path) -> None:
     add_figure(b, figure, Looks("Skin", "Hair", "Shirt", "Trousers", "Shoes"))
 
     # The sun comes in at the window, 27 degrees high, and lands on the middle of the floor.
-    b.sun("/World/Lights/Sun", (20.0, 16.8, 12.6), 0.8, (-26.4, -53.1, 0))
-    b.rect_light("/World/Lights/Sky", (1.9, 1.5), (1.0, 1.35, 1.9), (-2.80, 1.5, 1.05), (0, -90, 0))
+    b.sun("/World/Lights/Sun", (36.0, 30.6, 23.4), 0.8, (-26.4, -53.1, 0))
+    # Beside the sun's way, so that also renderers whose area lights block light let the sun in.
+    b.rect_light("/World/Lights/Sky", (3.0, 2.4), (13.0, 16.0, 20.0), (-4.3, 2.0, -0.5), (0, -132, 0))
     b.dome("/World/Lights/SkyDome", "./textures/sky.exr", 1.0, (0, 140, 0))
-    b.sphere_light("/World/Lights/Lamp", 0.05, (46.0, 27.0, 11.5), (-2.15, 1.56, -1.72))
+    b.sphere_light("/World/Lights/Lamp", 0.05, (70.0, 41.0, 18.0), (-2.15, 1.56, -1.72))
 
     variants = b.stage.GetPrimAtPath("/World").GetVariantSets().AddVariantSet("sky")
     for name, hidden in (("rect", "SkyDome"), ("dome", "Sky")):
@@ -106,19 +107,19 @@ def _shell(b: StageBuilder) -> None:
     b.mesh(
         f"{room}/RightWall", quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]), "Wall"
     )
-    b.mesh(f"{room}/WindowWall", wall_with_hole(5.0, top, (0.9, 2.6, 0.8, 2.15)), "Wall", (left, 0, front), (0, 90, 0))
+    b.mesh(f"{room}/WindowWall", wall_with_hole(5.0, top, (0.7, 2.8, 0.6, 2.30)), "Wall", (left, 0, front), (0, 90, 0))
     b.mesh(f"{room}/SkirtingBack", box((5.2, 0.09, 0.02)), "Paint", (0, 0, back + 0.01))
     b.mesh(f"{room}/SkirtingRight", box((0.02, 0.09, 5.0)), "Paint", (right - 0.01, 0, 0.3))
     b.mesh(f"{room}/SkirtingLeft", box((0.02, 0.09, 5.0)), "Paint", (left + 0.01, 0, 0.3))
 
     window = b.component("Window")
-    b.mesh(f"{window}/Sill", box((0.34, 0.04, 1.86)), "Paint", (left - 0.02, 0.76, 1.05))
-    b.mesh(f"{window}/Head", box((0.20, 0.06, 1.82)), "Paint", (left - 0.08, 2.13, 1.05))
-    b.mesh(f"{window}/JambFar", box((0.20, 1.39, 0.06)), "Paint", (left - 0.08, 0.78, 0.19))
-    b.mesh(f"{window}/JambNear", box((0.20, 1.39, 0.06)), "Paint", (left - 0.08, 0.78, 1.91))
-    for index, z in enumerate((0.617, 1.05, 1.483)):
-        b.mesh(f"{window}/Upright{index + 1}", box((0.05, 1.35, 0.045)), "Paint", (left - 0.10, 0.8, z))
-    b.mesh(f"{window}/Crossbar", box((0.05, 0.045, 1.70)), "Paint", (left - 0.10, 1.60, 1.05))
+    b.mesh(f"{window}/Sill", box((0.34, 0.04, 2.26)), "Paint", (left - 0.02, 0.56, 1.05))
+    b.mesh(f"{window}/Head", box((0.20, 0.06, 2.22)), "Paint", (left - 0.08, 2.28, 1.05))
+    b.mesh(f"{window}/JambFar", box((0.20, 1.74, 0.06)), "Paint", (left - 0.08, 0.58, -0.01))
+    b.mesh(f"{window}/JambNear", box((0.20, 1.74, 0.06)), "Paint", (left - 0.08, 0.58, 2.11))
+    for index, z in enumerate((0.35, 1.05, 1.75)):
+        b.mesh(f"{window}/Upright{index + 1}", box((0.05, 1.7, 0.045)), "Paint", (left - 0.10, 0.6, z))
+    b.mesh(f"{window}/Crossbar", box((0.05, 0.045, 2.10)), "Paint", (left - 0.10, 1.55, 1.05))
 
 
 def _furniture(b: StageBuilder) -> None:

@@ -20,16 +20,31 @@ def build(folder: Path) -> None:
     b = StageBuilder(DOC)
     b.material("Blue", (0.05, 0.13, 0.58))
     b.material("Pale", (0.70, 0.67, 0.61))
-    b.material("Tiles", (0.4, 0.4, 0.4), texture="./textures/checker.png", texture_scale=(6, 6))
+    b.material("Dusk", (0.30, 0.29, 0.30))
+    b.material("Tiles", (0.4, 0.4, 0.4), texture="./textures/checker.png", texture_scale=(6.9, 8.7))
     b.material("Cone", (0.58, 0.36, 0.10), roughness=0.28, ior=1.6)
     b.material("Sphere", (0.92, 0.90, 0.88), roughness=0.22, metallic=1.0, ior=1.5)
     b.material("Box", (0.66, 0.30, 0.14))
     b.material("Ring", (0.55, 0.06, 0.08), roughness=0.35, ior=1.5)
 
     room = b.component("Set")
-    b.mesh(f"{room}/Floor", quad([(-2, 0, 2.6), (2.4, 0, 2.6), (2.4, 0, -1.6), (-2, 0, -1.6)]), "Tiles")
-    b.mesh(f"{room}/BlueWall", quad([(-2, 0, 2.6), (-2, 0, -1.6), (-2, 2.6, -1.6), (-2, 2.6, 2.6)]), "Blue")
-    b.mesh(f"{room}/PaleWall", quad([(-2, 0, -1.6), (2.4, 0, -1.6), (2.4, 2.6, -1.6), (-2, 2.6, -1.6)]), "Pale")
+    left, right, back, front, top = -2.0, 2.6, -1.6, 4.2, 2.7
+    b.mesh(f"{room}/Floor", quad([(left, 0, front), (right, 0, front), (right, 0, back), (left, 0, back)]), "Tiles")
+    b.mesh(
+        f"{room}/Ceiling", quad([(left, top, back), (right, top, back), (right, top, front), (left, top, front)]), "Pale"
+    )
+    b.mesh(
+        f"{room}/BlueWall", quad([(left, 0, front), (left, 0, back), (left, top, back), (left, top, front)]), "Blue"
+    )
+    b.mesh(
+        f"{room}/PaleWall", quad([(left, 0, back), (right, 0, back), (right, top, back), (left, top, back)]), "Pale"
+    )
+    b.mesh(
+        f"{room}/RightWall", quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]), "Pale"
+    )
+    b.mesh(
+        f"{room}/FrontWall", quad([(right, 0, front), (left, 0, front), (left, top, front), (right, top, front)]), "Dusk"
+    )
 
     things = b.component("Things")
     b.cone(f"{things}/Cone", 0.48, 1.25, "Cone", (-1.02, 0.625, -0.45))
@@ -38,7 +53,7 @@ def build(folder: Path) -> None:
     ring = [(0.20, 0.0), (0.27, 0.0), (0.30, 0.05), (0.27, 0.10), (0.20, 0.10), (0.17, 0.05), (0.20, 0.0)]
     b.mesh(f"{things}/Ring", lathe(ring[:-1] + [ring[0]], 16, closed=False), "Ring", (-0.55, 0, 0.85), smooth=True)
 
-    b.rect_light("/World/Lights/Key", (1.0, 1.0), (9.0, 8.6, 8.0), (0.9, 2.5, 0.6), (-38, 68, 0))
-    main = b.camera("Main", (0.95, 1.28, 4.1), (-0.12, 0.52, -0.3), 42)
+    b.rect_light("/World/Lights/Key", (1.0, 1.0), (30.0, 28.5, 26.5), (0.7, 2.45, 0.7), (-38, 68, 0))
+    main = b.camera("Main", (1.35, 1.32, 3.9), (-0.36, 0.52, -0.3), 46)
     b.render_settings(main)
     b.save(folder / "scene.usda")

@@ -38,7 +38,7 @@ def wood_planks(size: int = 256, planks: int = 6) -> F64:
     shift = np.random.default_rng(8).integers(0, size, planks)[row]
     grain = smooth_noise(size, size, (96, 5), 1) * 0.6 + smooth_noise(size, size, (32, 3), 2) * 0.4
     grain = np.stack([np.roll(grain[y], shift[y]) for y in range(size)])
-    image = mix((0.20, 0.105, 0.05), (0.42, 0.25, 0.13), np.clip(0.55 * grain + 0.45 * tone[:, None], 0, 1))
+    image = mix((0.30, 0.175, 0.09), (0.56, 0.37, 0.21), np.clip(0.55 * grain + 0.45 * tone[:, None], 0, 1))
     image[(np.arange(size) * planks) % size < planks] *= 0.55
     for y in range(size):
         image[y, (np.arange(size) + shift[y]) % size < 2] *= 0.6
@@ -56,11 +56,11 @@ def rug(size: int = 256) -> F64:
     edge = np.minimum(np.minimum(x, 1 - x), np.minimum(y, 1 - y))
     lozenge = np.abs((x * 6) % 1 - 0.5) + np.abs((y * 4) % 1 - 0.5)
     image = np.empty((size, size, 3))
-    image[:] = (0.52, 0.075, 0.05)
-    image[lozenge < 0.26] = (0.66, 0.44, 0.19)
-    image[lozenge < 0.13] = (0.10, 0.10, 0.20)
-    image[edge < 0.10] = (0.09, 0.09, 0.18)
-    image[(edge < 0.075) & (edge > 0.055)] = (0.66, 0.44, 0.19)
+    image[:] = (0.62, 0.12, 0.07)
+    image[lozenge < 0.30] = (0.74, 0.62, 0.42)
+    image[lozenge < 0.13] = (0.62, 0.12, 0.07)
+    image[edge < 0.10] = (0.74, 0.62, 0.42)
+    image[(edge < 0.075) & (edge > 0.055)] = (0.10, 0.11, 0.22)
     image[edge < 0.025] = (0.52, 0.075, 0.05)
     return image * (0.88 + 0.24 * smooth_noise(size, size, (64, 64), 5))[..., None]
 

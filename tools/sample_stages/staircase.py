@@ -21,11 +21,12 @@ def build(folder: Path) -> None:
     b.material("Ceiling", (0.84, 0.82, 0.78))
     b.material("Stone", (0.52, 0.49, 0.45))
     b.material("Marble", (0.76, 0.75, 0.72), roughness=0.4, ior=1.5)
-    b.material("Terracotta", (0.52, 0.21, 0.11))
+    b.material("Terracotta", (0.58, 0.33, 0.22))
+    b.material("Blue", (0.16, 0.30, 0.42), roughness=0.5, ior=1.5)
     b.material("Copper", (0.72, 0.36, 0.20), roughness=0.5, ior=1.5)
     b.material("Runner", (0.34, 0.05, 0.06))
 
-    left, right, back, front, top = -1.9, 2.1, -2.9, 3.2, 3.5
+    left, right, back, front, top = -1.9, 2.1, -2.9, 4.9, 3.6
     hall = b.component("Hall")
     b.mesh(f"{hall}/Floor", quad([(left, 0, front), (right, 0, front), (right, 0, back), (left, 0, back)]), "Stone")
     b.mesh(
@@ -68,22 +69,23 @@ def build(folder: Path) -> None:
     b.mesh(f"{statue}/Plinth", lathe([(0.36, 0), (0.36, 0.08), (0.30, 0.10), (0.28, 0.36), (0.33, 0.40), (0.33, 0.46)], 24), "Stone")  # noqa: E501
     figure = b.group(f"{statue}/Figure", (0, 0.46, 0))
     pose = {
-        "ArmLeft": (-70.0, 0.0, 24.0),
-        "ForearmLeft": (-62.0, 0.0, 0.0),
+        "ArmLeft": (-8.0, 0.0, 112.0),
+        "ForearmLeft": (0.0, 0.0, 52.0),
         "ArmRight": (8.0, 0.0, -16.0),
         "ForearmRight": (-34.0, 0.0, 12.0),
         "Head": (-8.0, 24.0, 0.0),
     }
     add_figure(b, figure, Looks.one("Marble"), Pose(pose), robe=True)
+    b.sphere(f"{figure}/ArmLeft/ForearmLeft/Orb", 0.085, "Copper", (0.0, -0.47, 0.03))
 
-    above = b.component("Cylinder", (0.35, 2.62, 0.10), doc="Casts the indirect shadow.")
-    b.cylinder(f"{above}/Body", 0.34, 1.9, "Copper", axis="X", rotate=(0, 12, 0))
+    above = b.component("Cylinder", (0.30, 2.78, 0.10), doc="Casts the indirect shadow.")
+    b.cylinder(f"{above}/Body", 0.34, 2.0, "Blue", axis="X", rotate=(0, 12, 0))
 
     # The panel lies on a ledge of the right wall and looks up.
-    b.rect_light("/World/Lights/Cove", (0.5, 2.2), (46.0, 40.0, 32.0), (1.75, 2.75, 0.4), (90, 0, 0))
-    ledge = b.component("Ledge", (1.8, 2.68, 0.4))
+    b.rect_light("/World/Lights/Cove", (0.5, 2.2), (64.0, 60.0, 54.0), (1.78, 2.75, 0.9), (90, 0, 0))
+    ledge = b.component("Ledge", (1.8, 2.68, 0.9))
     b.mesh(f"{ledge}/Board", box((0.6, 0.05, 2.4)), "Plaster")
 
-    main = b.camera("Main", (0.55, 1.62, 3.05), (-0.05, 1.22, -0.9), 64)
+    main = b.camera("Main", (0.62, 1.66, 4.6), (0.10, 1.46, -0.6), 53)
     b.render_settings(main)
     b.save(folder / "scene.usda")
