@@ -59,6 +59,21 @@ def newest_version(type_: str) -> int:
     return max(known, default=0)
 
 
+def check_known(name: str, type_: str, version: int, where: str) -> None:
+    """Refuse an element that has a known purpose but an unknown type, or a version newer than this package reads.
+
+    Raises
+    ------
+    SidecarError
+        It names the element and asks for an update.
+    """
+    if name in SLOTS and (type_ != SLOTS[name] or version > newest_version(type_)):
+        raise SidecarError(
+            f"{where}: element '{name}' is {type_} version {version}, and this icheat_usd reads {SLOTS[name]} up to "
+            f"version {newest_version(SLOTS[name])}; update icheat_usd"
+        )
+
+
 def upgraded(element: Element) -> Element:
     """The element after every registered step from its version on."""
     while (step := _STEPS.get((element.type, element.version))) is not None:
@@ -105,12 +120,7 @@ def decode_payload(elements: Mapping[str, Element], *, anchor: str, where: str) 
         if name not in SLOTS:
             unknown[name] = element
             continue
-        newest = newest_version(element.type)
-        if element.type != SLOTS[name] or element.version > newest:
-            raise SidecarError(
-                f"{where}: element '{name}' is {element.type} version {element.version}, and this icheat_usd reads "
-                f"{SLOTS[name]} up to version {newest_version(SLOTS[name])}; update icheat_usd"
-            )
+        check_known(name, element.type, element.version, where)
         element = upgraded(element)
         try:
             decoded[name] = _READERS[element.type, element.version](element, anchor)

@@ -24,7 +24,7 @@ import numpy as np
 from icheat_usd.edits.model import Payload
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar.canonical import Array, Element, digest_of, kind_of
-from icheat_usd.sidecar.elements import decode_payload
+from icheat_usd.sidecar.elements import check_known, decode_payload
 
 FORMAT = "icheat-sidecar"
 FORMAT_VERSION = 1
@@ -104,7 +104,7 @@ def read_payload(
     """
     where = _names(file, name)
     with open_sidecar(file, where) as root:
-        elements = read_elements(root, digest, where, limit_bytes)
+        elements = read_elements(root, digest, where, limit_bytes, refuse_newer=True)
     return decode_payload(elements, anchor=anchor, where=f"{where}: payload {digest[:12]}")
 
 
@@ -210,8 +210,10 @@ def open_sidecar(file: Source, where: str) -> Iterator[h5py.Group]:
         yield root
 
 
-def read_elements(root: h5py.Group, digest: str, where: str, limit_bytes: int) -> dict[str, Element]:
-    """All elements of a payload as they are stored, their digest verified."""
+def read_elements(
+    root: h5py.Group, digest: str, where: str, limit_bytes: int, *, refuse_newer: bool = False
+) -> dict[str, Element]:
+    """All elements of a payload as they are stored, their digest verified; newer ones may be kept for copying."""
     with _naming_damage(where):
         payloads = _child_group(root, "payloads", where)
         if not _DIGEST.fullmatch(digest) or not payloads.id.links.exists(digest.encode()):
@@ -228,12 +230,18 @@ def read_elements(root: h5py.Group, digest: str, where: str, limit_bytes: int) -
             place = f"{where}: payload {digest[:12]}: element '{name}'"
             group = _child_group(payload, name, f"{where}: payload {digest[:12]}")
             type_, version = _element_mark(group, place)
+            if refuse_newer:
+                # Before the values: those of a newer element may look like damage.
+                check_known(name, type_, version, f"{where}: payload {digest[:12]}")
             datasets = {
                 path: _read_dataset(dataset, f"{place}: '{path}'", budget)
                 for path, dataset in _datasets(group, place, count)
             }
             elements[name] = Element(type_, version, datasets)
-        found = digest_of(elements)
+        try:
+            found = digest_of(elements)
+        except SidecarError as problem:
+            raise SidecarError(f"{where}: payload {digest[:12]}: {problem}") from problem
     if found != digest:
         raise SidecarError(
             f"{where}: payload {digest[:12]} is damaged: its contents have digest {found[:12]}; {_RESTORE}"

@@ -90,7 +90,7 @@ def assert_same(a: Payload, b: Payload) -> None:
             np.testing.assert_array_equal(values, b.unknown[name].datasets[path])
 
 
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(payloads=st.lists(_payloads, min_size=1, max_size=2))
 def test_any_payloads_come_back_exactly_and_under_the_digest_they_had(payloads: list[Payload], tmp_path: Path) -> None:
     file, digests = write_payloads(tmp_path, payloads, anchor="/World")
