@@ -14,7 +14,7 @@ centimetres instead of metres leaves its picture as it was, as for lights that a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,9 @@ from icheat_usd.stage.transforms import Placement, from_gf
 
 #: Radius, in metres, of the sphere that stands in for a point light whose radius is zero.
 POINT_RADIUS = 1e-3
+
+#: MeshLightAPI's way with materials: the light is the material's emission, tinted by the light's inputs.
+GLOW = "materialGlowTintsLight"
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,32 @@ def read_lights(
     return _table(rows), tuple(row.path for row in rows), list(reader.report.findings())
 
 
+def read_mesh_factors(prims: Iterable[Usd.Prim], time: Usd.TimeCode | float | None) -> dict[str, F64]:
+    """What MeshLightAPI multiplies the emission of meshes with when they light the scene.
+
+    Parameters
+    ----------
+    prims
+        Prims that may be mesh lights, instance proxies included; others are passed over.
+    time
+        When inputs are read; None is the earliest time.
+
+    Returns
+    -------
+    dict of str to (3,) float64
+        Colour, intensity, exposure and colour temperature as one factor, by scene path. A camera
+        sees the material's own emission: UsdLux lets these inputs act on the light it gives only.
+        Modes other than "materialGlowTintsLight" have no factor; `read_lights` reports them.
+    """
+    code = time_code(time)
+    reader = _Reader(code, Placement(1.0, np.zeros(3), code), TextureLibrary())
+    return {
+        str(prim.GetPath()): reader.radiance(prim, None, 1.0)
+        for prim in prims
+        if prim.IsA(UsdGeom.Mesh) and prim.HasAPI(UsdLux.LightAPI) and _material_mode(prim) == GLOW
+    }
+
+
 def with_mesh_lights(
     lights: Lights,
     paths: tuple[str, ...],
@@ -96,6 +125,7 @@ def with_mesh_lights(
     surfaces: Sequence[Surface],
     materials: Materials,
     textures: Textures,
+    factors: Mapping[str, F64] | None = None,
 ) -> tuple[Lights, tuple[str, ...]]:
     """Append one light per placed mesh that has triangles of an emissive material.
 
@@ -106,12 +136,15 @@ def with_mesh_lights(
     geometry, surfaces, materials, textures
         Of the snapshot. A material emits where its emissive colour is above zero in any channel, or
         where the image of its emissive colour has a texel that is after scale and bias.
+    factors
+        What `read_mesh_factors` found; surfaces that are not among them have factor 1.
 
     Returns
     -------
     Lights, tuple of str
         The new rows' paths are their surfaces'; instances of a point instancer share one.
     """
+    factors = factors or {}
     emissive = np.array((materials.emission > 0.0).any(axis=1))
     for row in np.flatnonzero(materials.texture[:, Texture.EMISSION] >= 0):
         emissive[row] = _texture_emits(materials, textures, int(row))
@@ -126,7 +159,7 @@ def with_mesh_lights(
             path=surfaces[geometry.instance_surface[i]].path,
             kind=LightKind.MESH,
             to_world=geometry.instance_to_world[i].astype(np.float64),
-            radiance=np.ones(3),
+            radiance=factors.get(surfaces[geometry.instance_surface[i]].path, np.ones(3)),
             surface=int(geometry.instance_surface[i]),
         )
         for i in instances
@@ -221,6 +254,10 @@ def distant_size_factor(half_angle: float) -> float:
     return math.pi * (sine if theta <= math.pi / 2.0 else 2.0 - sine)
 
 
+def _material_mode(prim: Usd.Prim) -> str:
+    return str(prim.GetAttribute("light:materialSyncMode").Get() or "noMaterialResponse")
+
+
 # Reading ----------------------------------------------------------------------------------------
 
 
@@ -292,12 +329,12 @@ class _Reader:
     def _distant(self, prim: Usd.Prim, linear: F64) -> _Light | None:
         half_angle = math.radians(min(max(self._number(prim, "angle", 0.53), 0.0), 360.0)) / 2.0
         factor = distant_size_factor(half_angle)
-        return self._light(prim, LightKind.DISTANT, (half_angle, 0.0), self._radiance(prim, factor, 50000.0))
+        return self._light(prim, LightKind.DISTANT, (half_angle, 0.0), self.radiance(prim, factor, 50000.0))
 
     def _dome(self, prim: Usd.Prim, linear: F64) -> _Light | None:
         # Ignores `normalize`: it has no size.
         texture = self._texture(prim, "repeat", "clamp")
-        light = self._light(prim, LightKind.DOME, (0.0, 0.0), self._radiance(prim, None, 1.0), texture)
+        light = self._light(prim, LightKind.DOME, (0.0, 0.0), self.radiance(prim, None, 1.0), texture)
         if str(prim.GetTypeName()) == "DomeLight_1" and self._pole_axis(prim) == "Z":
             # A quarter turn about X takes the pole from +Y to +Z, longitude 0 from +Z to -Y.
             turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -318,7 +355,7 @@ class _Reader:
                 "it has no area and gives no light; give it a size, or a transform that does not flatten it.",
             )
             return None
-        return self._light(prim, kind, size, self._radiance(prim, area, 1.0), texture)
+        return self._light(prim, kind, size, self.radiance(prim, area, 1.0), texture)
 
     def _light(
         self, prim: Usd.Prim, kind: LightKind, size: tuple[float, float], radiance: F64, texture: int = -1
@@ -328,7 +365,8 @@ class _Reader:
 
     # Inputs -------------------------------------------------------------------------------------
 
-    def _radiance(self, prim: Usd.Prim, size_factor: float | None, default_intensity: float) -> F64:
+    def radiance(self, prim: Usd.Prim, size_factor: float | None, default_intensity: float) -> F64:
+        """Radiance of a light; a size factor of None stands for a light that ignores `normalize`."""
         color = self._value(prim, "color", Gf.Vec3f(1.0))
         radiance = np.array([float(c) for c in color], np.float64)
         radiance *= self._number(prim, "intensity", default_intensity) * 2.0 ** self._number(prim, "exposure", 0.0)
@@ -376,18 +414,13 @@ class _Reader:
 
     def _report_kind(self, prim: Usd.Prim, kind: str) -> None:
         if prim.IsA(UsdGeom.Mesh):
-            # Its material's emission lights the scene as any emissive mesh does; only what LightAPI adds is lost.
-            plain = all(
-                np.allclose(np.array(self._value(prim, name, default), np.float64), np.array(default, np.float64))
-                for name, default in (("color", (1.0, 1.0, 1.0)), ("intensity", 1.0), ("exposure", 0.0))
-            ) and not (self._value(prim, "normalize", False) or self._value(prim, "enableColorTemperature", False))
-            mode = prim.GetAttribute("light:materialSyncMode").Get() or "noMaterialResponse"
-            if mode != "materialGlowTintsLight":
+            mode = _material_mode(prim)
+            if mode != GLOW:
                 self._unsupported(
                     prim, "light:materialSyncMode", f"'{mode}' is ignored, and the mesh shines by its material alone"
                 )
-            elif not plain:
-                self._unsupported(prim, "MeshLightAPI", "its light inputs are ignored, and its material alone shines")
+            elif self._value(prim, "normalize", False):
+                self._unsupported(prim, "normalize", "a mesh shines by its radiance, whatever its area")
             self._report_unsupported(prim, kind)
             return
         if prim.IsA(UsdGeom.Gprim):

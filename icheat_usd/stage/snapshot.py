@@ -12,7 +12,7 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.stage.camera import find_camera, frame_camera, read_camera, read_render_choices
 from icheat_usd.stage.instancing import InstancerReader
-from icheat_usd.stage.lights import read_lights, with_mesh_lights
+from icheat_usd.stage.lights import read_lights, read_mesh_factors, with_mesh_lights
 from icheat_usd.stage.materials import MaterialLibrary
 from icheat_usd.stage.opening import composition_findings, quiet_usd
 from icheat_usd.stage.placing import GeometryBuilder
@@ -104,7 +104,13 @@ def take_snapshot(
         lights, light_paths, light_findings = read_lights(lights_shown, when, placement, materials.textures)
         tables, material_paths = materials.tables()
         lights, light_paths = with_mesh_lights(
-            lights, light_paths, geometry, builder.surfaces, tables, materials.textures.table()
+            lights,
+            light_paths,
+            geometry,
+            builder.surfaces,
+            tables,
+            materials.textures.table(),
+            read_mesh_factors(lights_shown, when),
         )
         report.extend(materials.findings)
         report.extend(light_findings)

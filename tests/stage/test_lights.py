@@ -16,6 +16,7 @@ from icheat_usd.stage.lights import (
     disk_area,
     distant_size_factor,
     read_lights,
+    read_mesh_factors,
     rect_area,
     sphere_area,
     with_mesh_lights,
@@ -329,13 +330,12 @@ def test_lights_of_other_kinds_are_left_out_and_reported(tmp_path: Path, kind: s
     ("inputs", "features"),
     [
         ("", []),
-        ("float inputs:intensity = 5", ["MeshLightAPI"]),
+        ("float inputs:intensity = 5", []),
+        ("bool inputs:normalize = 1", ["normalize"]),
         ('uniform token light:materialSyncMode = "independent"', ["light:materialSyncMode"]),
     ],
 )
-def test_a_mesh_light_shines_by_its_material_and_says_what_is_ignored(
-    tmp_path: Path, inputs: str, features: list[str]
-) -> None:
+def test_a_mesh_light_says_what_is_ignored(tmp_path: Path, inputs: str, features: list[str]) -> None:
     body = light("Mesh", inputs, metadata='( prepend apiSchemas = ["MeshLightAPI"] )')
     _, paths, findings, _ = read(write_stage(tmp_path, body))
     assert paths == () and [f.feature for f in findings] == features
@@ -402,6 +402,23 @@ def test_each_placed_mesh_with_emissive_triangles_is_one_light(
     assert [column.dtype for column in lights] == [column.dtype for column in reference]
     again, again_paths = with_mesh_lights(lights, paths, two_meshes(), SURFACES, materials, textures)
     assert again.triangle_begin.tolist() == [0, 0, n, 2 * n, 3 * n, 4 * n] and len(again_paths) == 5
+
+
+def test_light_inputs_of_a_mesh_tint_what_its_material_gives(tmp_path: Path) -> None:
+    inputs = "float inputs:intensity = 3\nfloat inputs:exposure = 1\ncolor3f inputs:color = (1, 0.5, 0)\n"
+    metadata = '( prepend apiSchemas = ["MeshLightAPI"] )'
+    body = light("Mesh", inputs, "a", metadata) + light("Mesh", "", "b", metadata)
+    body += light("Mesh", inputs + 'uniform token light:materialSyncMode = "independent"', "c", metadata)
+    body += light("Mesh", "", "d") + light("RectLight", inputs)
+    stage = write_stage(tmp_path, body)
+    factors = read_mesh_factors(stage.Traverse(), None)
+    assert sorted(factors) == ["/a", "/b"]
+    np.testing.assert_allclose(factors["/a"], [6, 3, 0])
+    lights, paths, _, _ = read(stage)
+    materials, textures = three_materials(tmp_path, (0, 0, 0))
+    lights, paths = with_mesh_lights(lights, paths, two_meshes(), SURFACES, materials, textures, factors)
+    assert paths == ("/L", "/a", "/c")
+    np.testing.assert_allclose(lights.radiance[1:], [[6, 3, 0], [1, 1, 1]])
 
 
 def test_a_dark_scene_gains_no_lights(tmp_path: Path) -> None:
