@@ -59,7 +59,7 @@ def test_a_ray_past_everything_misses_with_minus_one_and_infinity(build: Build) 
 def test_t_max_ends_a_ray_in_units_of_its_direction(build: Build) -> None:
     tracer = build(quad_scene())
     origin, direction = np.tile(rows((0.1, 1, 0.2)), (4, 1)), np.tile(rows((0, -0.5, 0)), (4, 1))
-    limits = np.float32([1.99, 2.01, 0.0, -1.0])
+    limits = np.array([1.99, 2.01, 0.0, -1.0], np.float32)
     np.testing.assert_array_equal(tracer.intersect(origin, direction, limits).instance, [-1, 0, -1, -1])
     np.testing.assert_array_equal(tracer.occluded(origin, direction, limits), [False, True, False, False])
     assert tracer.occluded(origin, direction, 2.01).all() and tracer.occluded(origin, direction).all()
@@ -89,7 +89,7 @@ def test_no_ray_leaks_through_the_shared_edges_of_a_closed_mesh(build: Build) ->
 def test_instances_carry_their_own_number_and_the_rows_of_their_mesh(build: Build) -> None:
     first, second = Mesh(box(1)), Mesh(box(0.5), transforms=[translation(-3, 0, 0), translation(3, 0, 0)])
     tracer = build(make_snapshot([first, second]))
-    hits = tracer.intersect(np.float32([[-3, 5, 0.1], [0, 5, 0.1], [3, 5, 0.1]]), np.tile(rows((0, -1, 0)), (3, 1)))
+    hits = tracer.intersect(rows((-3, 5, 0.1), (0, 5, 0.1), (3, 5, 0.1)), np.tile(rows((0, -1, 0)), (3, 1)))
     np.testing.assert_array_equal(hits.instance, [1, 0, 2])
     assert hits.triangle[1] < 12 and (hits.triangle[[0, 2]] >= 12).all() and (hits.triangle < 24).all()
     np.testing.assert_allclose(hits.distance, [4.75, 4.5, 4.75], rtol=1e-6)
@@ -163,7 +163,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     before = numba.get_num_threads()
     results = []
     try:
-        for n in (1, numba.config.NUMBA_NUM_THREADS):
+        for n in (1, before):
             numba.set_num_threads(n)
             results.append([*tracer.intersect(origins, directions), tracer.occluded(origins, directions, 0.7)])
     finally:
@@ -205,6 +205,6 @@ def test_many_instances_share_one_mesh() -> None:
     snapshot = make_snapshot([Mesh(points, transforms=places)])
     tracer = EmbreeTracer(snapshot)  # 3 M triangles as copies: instances by default
     origin = np.array([[0.03 * (i % 60), 0.03 * (i // 60), 1] for i in range(n)], np.float32)
-    hits = tracer.intersect(origin + np.float32([0.001, 0.002, 0]), np.tile(rows((0, 0, -1)), (n, 1)))
+    hits = tracer.intersect(origin + rows((0.001, 0.002, 0)), np.tile(rows((0, 0, -1)), (n, 1)))
     np.testing.assert_array_equal(hits.instance, np.arange(n))
     np.testing.assert_allclose(hits.distance, 0.9902, atol=3e-4)  # inside the sphere: facets
