@@ -43,17 +43,23 @@ def build(folder: Path) -> None:
         "Floor",
     )
     b.mesh(
-        f"{room}/Ceiling", quad([(left, top, back), (right, top, back), (right, top, front), (left, top, front)]), "Wall"
+        f"{room}/Ceiling",
+        quad([(left, top, back), (right, top, back), (right, top, front), (left, top, front)]),
+        "Wall",
     )
     b.mesh(f"{room}/BackWall", quad([(left, 0, back), (right, 0, back), (right, top, back), (left, top, back)]), "Wall")
     b.mesh(
         f"{room}/LeftWall", quad([(left, 0, front), (left, 0, back), (left, top, back), (left, top, front)]), "Yellow"
     )
     b.mesh(
-        f"{room}/RightWall", quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]), "Wall"
+        f"{room}/RightWall",
+        quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]),
+        "Wall",
     )
     b.mesh(
-        f"{room}/FrontWall", quad([(right, 0, front), (left, 0, front), (left, top, front), (right, top, front)]), "Wall"
+        f"{room}/FrontWall",
+        quad([(right, 0, front), (left, 0, front), (left, top, front), (right, top, front)]),
+        "Wall",
     )
 
     couch = b.component("Couch", (0.55, 0, -1.28))
@@ -62,7 +68,9 @@ def build(folder: Path) -> None:
     b.mesh(f"{couch}/Back", cushion((1.42, 0.50, 0.20), 0.07), "Couch", (0, 0.42, -0.27), (-8, 0, 0), smooth=True)
     b.mesh(f"{couch}/ArmLeft", cushion((0.20, 0.48, 0.84), 0.07), "Couch", (-0.80, 0.08, 0), smooth=True)
     b.mesh(f"{couch}/ArmRight", cushion((0.20, 0.48, 0.84), 0.07), "Couch", (0.80, 0.08, 0), smooth=True)
-    b.mesh(f"{couch}/Pillow", cushion((0.42, 0.40, 0.14), 0.07), "Linen", (0.45, 0.48, -0.04), (-22, -10, -5), smooth=True)  # noqa: E501
+    b.mesh(
+        f"{couch}/Pillow", cushion((0.42, 0.40, 0.14), 0.07), "Linen", (0.45, 0.48, -0.04), (-22, -10, -5), smooth=True
+    )  # noqa: E501
     b.mesh(f"{room}/Shelf", box((0.9, 0.04, 0.24)), "Linen", (-1.5, 1.35, -1.68))
 
     b.sphere(f"{b.component('Ball', _every(_ball))}/Surface", 0.14, "Ball")

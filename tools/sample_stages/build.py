@@ -194,9 +194,7 @@ class StageBuilder:
             diffuse_input.ConnectToSource(self._texture(path, texture, texture_scale, diffuse), "rgb")
         return name
 
-    def _texture(
-        self, path: str, file: str, scale: tuple[float, float], fallback: Color
-    ) -> UsdShade.ConnectableAPI:
+    def _texture(self, path: str, file: str, scale: tuple[float, float], fallback: Color) -> UsdShade.ConnectableAPI:
         reader = UsdShade.Shader.Define(self.stage, f"{path}/St")
         reader.CreateIdAttr("UsdPrimvarReader_float2")
         reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")

@@ -83,7 +83,9 @@ def add_figure(
         ((0, 0.208, 0.000), 0.024, 0.028),
     ]
     part("Face", head, face, looks.skin)
-    builder.mesh(f"{head}/Nose", cushion((0.026, 0.048, 0.042), 0.011), looks.skin, (0, 0.062, 0.104), (-16, 0, 0), smooth=True)  # noqa: E501
+    builder.mesh(
+        f"{head}/Nose", cushion((0.026, 0.048, 0.042), 0.011), looks.skin, (0, 0.062, 0.104), (-16, 0, 0), smooth=True
+    )  # noqa: E501
     hair = [
         ((0, 0.055, -0.052), 0.056, 0.040),
         ((0, 0.090, -0.034), 0.088, 0.072),

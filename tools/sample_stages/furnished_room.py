@@ -102,10 +102,14 @@ def _shell(b: StageBuilder) -> None:
         f"{room}/BackWall", quad([(left, 0, back), (right, 0, back), (right, top, back), (left, top, back)]), "Accent"
     )
     b.mesh(
-        f"{room}/FrontWall", quad([(right, 0, front), (left, 0, front), (left, top, front), (right, top, front)]), "Wall"
+        f"{room}/FrontWall",
+        quad([(right, 0, front), (left, 0, front), (left, top, front), (right, top, front)]),
+        "Wall",
     )
     b.mesh(
-        f"{room}/RightWall", quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]), "Wall"
+        f"{room}/RightWall",
+        quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]),
+        "Wall",
     )
     b.mesh(f"{room}/WindowWall", wall_with_hole(5.0, top, (0.7, 2.8, 0.6, 2.30)), "Wall", (left, 0, front), (0, 90, 0))
     b.mesh(f"{room}/SkirtingBack", box((5.2, 0.09, 0.02)), "Paint", (0, 0, back + 0.01))
@@ -131,9 +135,25 @@ def _furniture(b: StageBuilder) -> None:
     b.mesh(f"{sofa}/BackRight", cushion((0.86, 0.50, 0.20), 0.07), "Sofa", (0.44, 0.46, -0.29), (-9, 0, 0), smooth=True)
     b.mesh(f"{sofa}/ArmLeft", cushion((0.22, 0.50, 0.88), 0.07), "Sofa", (-0.97, 0.10, 0), smooth=True)
     b.mesh(f"{sofa}/ArmRight", cushion((0.22, 0.50, 0.88), 0.07), "Sofa", (0.97, 0.10, 0), smooth=True)
-    b.mesh(f"{sofa}/PillowMustard", cushion((0.46, 0.44, 0.15), 0.07), "Mustard", (-0.62, 0.52, -0.06), (-22, 14, 6), smooth=True)  # noqa: E501
-    b.mesh(f"{sofa}/PillowLinen", cushion((0.44, 0.42, 0.14), 0.07), "Linen", (0.60, 0.52, -0.06), (-24, -12, -5), smooth=True)  # noqa: E501
-    b.mesh(f"{sofa}/PillowRust", cushion((0.36, 0.34, 0.13), 0.06), "Rust", (0.30, 0.52, 0.03), (-26, -4, 4), smooth=True)  # noqa: E501
+    b.mesh(
+        f"{sofa}/PillowMustard",
+        cushion((0.46, 0.44, 0.15), 0.07),
+        "Mustard",
+        (-0.62, 0.52, -0.06),
+        (-22, 14, 6),
+        smooth=True,
+    )  # noqa: E501
+    b.mesh(
+        f"{sofa}/PillowLinen",
+        cushion((0.44, 0.42, 0.14), 0.07),
+        "Linen",
+        (0.60, 0.52, -0.06),
+        (-24, -12, -5),
+        smooth=True,
+    )  # noqa: E501
+    b.mesh(
+        f"{sofa}/PillowRust", cushion((0.36, 0.34, 0.13), 0.06), "Rust", (0.30, 0.52, 0.03), (-26, -4, 4), smooth=True
+    )  # noqa: E501
     for index, (x, z) in enumerate(((-0.92, 0.34), (0.92, 0.34), (-0.92, -0.34), (0.92, -0.34))):
         b.cylinder(f"{sofa}/Foot{index + 1}", 0.025, 0.11, "Wood", (x, 0.055, z))
 
@@ -160,7 +180,11 @@ def _furniture(b: StageBuilder) -> None:
     _chair(b, second)
 
     lamp = b.component("FloorLamp", (-2.15, 0, -1.72))
-    b.mesh(f"{lamp}/Stand", lathe([(0.15, 0), (0.15, 0.015), (0.10, 0.03), (0.014, 0.04), (0.012, 1.0), (0.012, 1.48)], 12), "Brass")  # noqa: E501
+    b.mesh(
+        f"{lamp}/Stand",
+        lathe([(0.15, 0), (0.15, 0.015), (0.10, 0.03), (0.014, 0.04), (0.012, 1.0), (0.012, 1.48)], 12),
+        "Brass",
+    )  # noqa: E501
     shade = [(0.21, 1.42), (0.205, 1.47), (0.165, 1.68), (0.16, 1.72)]
     b.mesh(f"{lamp}/Shade", lathe(shade, 16, closed=False), "Shade", smooth=True)
 
@@ -178,12 +202,32 @@ def _furniture(b: StageBuilder) -> None:
     for index, x in enumerate((-0.55, 0.55)):
         b.mesh(f"{shelf}/Side{index + 1}", box((0.025, 1.74, 0.30), 1.4), "Wood", (x, 0, 0))
     _books(b, shelf)
-    vase = [(0.045, 0), (0.05, 0.004), (0.085, 0.07), (0.075, 0.15), (0.03, 0.21), (0.034, 0.245), (0.026, 0.24), (0.022, 0.20)]  # noqa: E501
+    vase = [
+        (0.045, 0),
+        (0.05, 0.004),
+        (0.085, 0.07),
+        (0.075, 0.15),
+        (0.03, 0.21),
+        (0.034, 0.245),
+        (0.026, 0.24),
+        (0.022, 0.20),
+    ]  # noqa: E501
     b.mesh(f"{shelf}/Vase", lathe(vase, 12), "Ceramic", (0.30, 1.285, 0.02), smooth=True)
-    b.mesh(f"{shelf}/Jar", lathe([(0.06, 0), (0.065, 0.005), (0.065, 0.11), (0.05, 0.13)], 12), "Mustard", (-0.35, 1.685, 0), smooth=True)  # noqa: E501
+    b.mesh(
+        f"{shelf}/Jar",
+        lathe([(0.06, 0), (0.065, 0.005), (0.065, 0.11), (0.05, 0.13)], 12),
+        "Mustard",
+        (-0.35, 1.685, 0),
+        smooth=True,
+    )  # noqa: E501
 
     plant = b.component("Plant", (0.62, 0, -1.86))
-    b.mesh(f"{plant}/Pot", lathe([(0.10, 0), (0.105, 0.005), (0.14, 0.24), (0.145, 0.27), (0.125, 0.27), (0.12, 0.22)], 12), "Rust", smooth=True)  # noqa: E501
+    b.mesh(
+        f"{plant}/Pot",
+        lathe([(0.10, 0), (0.105, 0.005), (0.14, 0.24), (0.145, 0.27), (0.125, 0.27), (0.12, 0.22)], 12),
+        "Rust",
+        smooth=True,
+    )  # noqa: E501
     for index in range(11):
         turn = 137.5 * index
         lean = 14 + 4.2 * index

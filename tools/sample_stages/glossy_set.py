@@ -31,19 +31,21 @@ def build(folder: Path) -> None:
     left, right, back, front, top = -2.0, 2.6, -1.6, 4.2, 2.7
     b.mesh(f"{room}/Floor", quad([(left, 0, front), (right, 0, front), (right, 0, back), (left, 0, back)]), "Tiles")
     b.mesh(
-        f"{room}/Ceiling", quad([(left, top, back), (right, top, back), (right, top, front), (left, top, front)]), "Pale"
+        f"{room}/Ceiling",
+        quad([(left, top, back), (right, top, back), (right, top, front), (left, top, front)]),
+        "Pale",
+    )
+    b.mesh(f"{room}/BlueWall", quad([(left, 0, front), (left, 0, back), (left, top, back), (left, top, front)]), "Blue")
+    b.mesh(f"{room}/PaleWall", quad([(left, 0, back), (right, 0, back), (right, top, back), (left, top, back)]), "Pale")
+    b.mesh(
+        f"{room}/RightWall",
+        quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]),
+        "Pale",
     )
     b.mesh(
-        f"{room}/BlueWall", quad([(left, 0, front), (left, 0, back), (left, top, back), (left, top, front)]), "Blue"
-    )
-    b.mesh(
-        f"{room}/PaleWall", quad([(left, 0, back), (right, 0, back), (right, top, back), (left, top, back)]), "Pale"
-    )
-    b.mesh(
-        f"{room}/RightWall", quad([(right, 0, back), (right, 0, front), (right, top, front), (right, top, back)]), "Pale"
-    )
-    b.mesh(
-        f"{room}/FrontWall", quad([(right, 0, front), (left, 0, front), (left, top, front), (right, top, front)]), "Dusk"
+        f"{room}/FrontWall",
+        quad([(right, 0, front), (left, 0, front), (left, top, front), (right, top, front)]),
+        "Dusk",
     )
 
     things = b.component("Things")

@@ -59,14 +59,29 @@ def build(folder: Path) -> None:
     b.mesh(f"{stairs}/Parapet", box((0.14, 0.92, 0.68)), "Plaster", (1.03, 1.36, -2.66))
     for step in range(8):
         tread = box((1.0, 0.012, 0.29))
-        b.mesh(f"{stairs}/Runner{step + 1}", tread, "Runner", (0, round(0.17 * (step + 1), 4), round(-0.29 * (step + 0.5), 4)))  # noqa: E501
+        b.mesh(
+            f"{stairs}/Runner{step + 1}",
+            tread,
+            "Runner",
+            (0, round(0.17 * (step + 1), 4), round(-0.29 * (step + 0.5), 4)),
+        )  # noqa: E501
     for step in range(0, 8, 2):
-        b.cylinder(f"{stairs}/Post{step // 2 + 1}", 0.028, 0.86, "Copper", (1.03, round(0.17 * (step + 1) + 0.43, 4), round(-0.29 * (step + 0.5), 4)))  # noqa: E501
+        b.cylinder(
+            f"{stairs}/Post{step // 2 + 1}",
+            0.028,
+            0.86,
+            "Copper",
+            (1.03, round(0.17 * (step + 1) + 0.43, 4), round(-0.29 * (step + 0.5), 4)),
+        )  # noqa: E501
     rail = box((0.06, 0.05, 2.18))
     b.mesh(f"{stairs}/Rail", rail, "Copper", (1.03, 1.525, -1.015), (30.4, 0, 0))
 
     statue = b.component("Statue", (1.12, 0, 0.42), (0, -22, 0), doc="A statue on a plinth, in the cylinder's shade.")
-    b.mesh(f"{statue}/Plinth", lathe([(0.36, 0), (0.36, 0.08), (0.30, 0.10), (0.28, 0.36), (0.33, 0.40), (0.33, 0.46)], 24), "Stone")  # noqa: E501
+    b.mesh(
+        f"{statue}/Plinth",
+        lathe([(0.36, 0), (0.36, 0.08), (0.30, 0.10), (0.28, 0.36), (0.33, 0.40), (0.33, 0.46)], 24),
+        "Stone",
+    )  # noqa: E501
     figure = b.group(f"{statue}/Figure", (0, 0.46, 0))
     pose = {
         "ArmLeft": (-8.0, 0.0, 112.0),
