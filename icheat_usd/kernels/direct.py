@@ -9,13 +9,12 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import parallel_kernel
-from icheat_usd.kernels.environment import F32, Table
-from icheat_usd.kernels.lights import sample_analytic, sample_mesh
+from icheat_usd.kernels.environment import F32, F64, Table
+from icheat_usd.kernels.lights import hit_analytic, mesh_pdf, sample_analytic, sample_mesh
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 
 @parallel_kernel
@@ -92,14 +91,11 @@ def fill_mesh(
     radiance: F32,
     emissive: I64,
     barycentric: F32,
-    light_point: F32,
-    light_normal: F32,
-    light_side: U8,
 ) -> None:
     """Shadow rays of every point to one MESH light; as `fill_analytic`.
 
-    `radiance` lacks the emission of textured triangles, whose rows and places are in `emissive`
-    (-1: no ray) and `barycentric`; `light_normal` is turned to the receiver, `light_side` says from which.
+    `radiance` lacks the emission of the triangles, whose rows and places are in `emissive` (-1: no ray)
+    and `barycentric`.
     """
     for i in prange(position.shape[0]):
         if instance[i] < 0:
@@ -108,7 +104,7 @@ def fill_mesh(
         px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
         for k in range(n_samples):
             u1, u2 = sobol_pair(k, sequence)
-            e, b1, b2, lx, ly, lz, mx, my, mz, p = sample_mesh(lights, tables, light, px, py, pz, float(u1), float(u2))
+            e, b1, b2, lx, ly, lz, p = sample_mesh(lights, tables, light, px, py, pz, float(u1), float(u2))
             if p <= 0.0:
                 continue
             dx, dy, dz = lx - px, ly - py, lz - pz
@@ -121,7 +117,6 @@ def fill_mesh(
             if cosine:
                 weight *= shading_cosine
             row = i * n_samples + k
-            towards = -1.0 if wx * mx + wy * my + wz * mz > 0.0 else 1.0
             direction[row, 0] = wx
             direction[row, 1] = wy
             direction[row, 2] = wz
@@ -130,16 +125,8 @@ def fill_mesh(
             emissive[row] = e
             barycentric[row, 0] = b1
             barycentric[row, 1] = b2
-            light_point[row, 0] = lx
-            light_point[row, 1] = ly
-            light_point[row, 2] = lz
-            light_normal[row, 0] = towards * mx
-            light_normal[row, 1] = towards * my
-            light_normal[row, 2] = towards * mz
-            light_side[row] = 0 if towards > 0.0 else 1
             for c in range(3):
-                emission = 1.0 if tables.triangle_textured[e] else tables.triangle_emission[e, c]
-                radiance[row, c] = weight * lights.radiance[light, c] * emission
+                radiance[row, c] = weight * lights.radiance[light, c]
 
 
 @parallel_kernel
@@ -156,3 +143,71 @@ def sum_rays(values: F32, begin: I64, out: F32) -> None:
         out[i, 0] += np.float32(r)
         out[i, 1] += np.float32(g)
         out[i, 2] += np.float32(b)
+
+
+@parallel_kernel
+def fill_specular_numbers(point: I64, n_samples: int, seed: int, out: F32) -> None:
+    """Random pairs (n n_samples, 2) for the specular rays of each point, numbered by `point`."""
+    for i in prange(point.shape[0]):
+        sequence = hash_combine(hash_combine(seed, 0x12), point[i])
+        for k in range(n_samples):
+            u1, u2 = sobol_pair(k, sequence)
+            out[i * n_samples + k, 0] = u1
+            out[i * n_samples + k, 1] = u2
+
+
+@parallel_kernel
+def meet_analytic(
+    lights: Table,
+    textures: Table,
+    tables: Table,
+    light: int,
+    position: F32,
+    shading_normal: F32,
+    direction: F32,
+    distance: F32,
+    pdf: F64,
+    radiance: F32,
+) -> None:
+    """Where rays from surface points meet a light that is no mesh; rows of those that miss stay zero."""
+    for i in prange(position.shape[0]):
+        t, p, r, g, b = hit_analytic(
+            lights,
+            textures,
+            tables,
+            light,
+            float(position[i, 0]),
+            float(position[i, 1]),
+            float(position[i, 2]),
+            float(shading_normal[i, 0]),
+            float(shading_normal[i, 1]),
+            float(shading_normal[i, 2]),
+            float(direction[i, 0]),
+            float(direction[i, 1]),
+            float(direction[i, 2]),
+        )
+        if t <= 0.0:
+            continue
+        distance[i] = t
+        pdf[i] = p
+        radiance[i, 0] = r * lights.radiance[light, 0]
+        radiance[i, 1] = g * lights.radiance[light, 1]
+        radiance[i, 2] = b * lights.radiance[light, 2]
+
+
+@parallel_kernel
+def mesh_pdfs(lights: Table, tables: Table, light: I32, row: I64, position: F32, end: F32, out: F64) -> None:
+    """Density with which each emissive triangle `row` of `light` is sampled at `end`, seen from `position`."""
+    for i in prange(len(row)):
+        out[i] = mesh_pdf(
+            lights,
+            tables,
+            light[i],
+            row[i],
+            float(position[i, 0]),
+            float(position[i, 1]),
+            float(position[i, 2]),
+            float(end[i, 0]),
+            float(end[i, 1]),
+            float(end[i, 2]),
+        )

@@ -43,7 +43,6 @@ class LightTables(NamedTuple):
     triangle_cdf: NDArray[np.float64]  #: (n_emissive,) cumulative over each MESH light's triangles
     triangle_corners: NDArray[np.float64]  #: (n_emissive, 3, 3) world space
     triangle_emission: NDArray[np.float32]  #: (n_emissive, 3) mean emission of the material, over both sides
-    triangle_textured: NDArray[np.uint8]  #: (n_emissive,) 1: emission varies and is looked up per sample
 
 
 @kernel
@@ -458,13 +457,13 @@ def sample_analytic(
 def sample_mesh(
     lights: Table, tables: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
 ) -> Floats:
-    """Row of the emissive tables, barycentric (2), point (3), unit geometric normal (3), pdf per solid angle."""
+    """Row of the emissive tables, barycentric (2), point (3), pdf per solid angle."""
     begin = lights.triangle_begin[light]
     row = search_cdf(tables.triangle_cdf, begin, lights.triangle_begin[light + 1], u1)
     below = tables.triangle_cdf[row - 1] if row > begin else 0.0
     probability = tables.triangle_cdf[row] - below
     if probability <= 0.0:
-        return row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0
+        return row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     v1 = min(max((u1 - below) / probability, 0.0), 1.0)
     # low-distortion map of the square to the triangle (Heitz 2019) keeps strata compact
     if u2 > v1:
@@ -482,14 +481,14 @@ def sample_mesh(
     ly = p[0, 1] + b1 * ay + b2 * by
     lz = p[0, 2] + b1 * az + b2 * bz
     if double_area == 0.0:
-        return row, b1, b2, lx, ly, lz, 0.0, 0.0, 1.0, 0.0
+        return row, b1, b2, lx, ly, lz, 0.0
     nx, ny, nz = nx / double_area, ny / double_area, nz / double_area
     dx, dy, dz = lx - px, ly - py, lz - pz
     distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
     cosine = abs(_dot(dx, dy, dz, nx, ny, nz)) / distance if distance > 0.0 else 0.0
     if cosine < 1e-9:
-        return row, b1, b2, lx, ly, lz, nx, ny, nz, 0.0
-    return row, b1, b2, lx, ly, lz, nx, ny, nz, _to_solid_angle(2.0 * probability / double_area, distance, cosine)
+        return row, b1, b2, lx, ly, lz, 0.0
+    return row, b1, b2, lx, ly, lz, _to_solid_angle(2.0 * probability / double_area, distance, cosine)
 
 
 # Where rays meet lights ---------------------------------------------------------------------------

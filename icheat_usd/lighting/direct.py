@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from icheat_usd.kernels.direct import fill_analytic, fill_mesh, sum_rays
+from icheat_usd.kernels.direct import (
+    fill_analytic,
+    fill_mesh,
+    fill_specular_numbers,
+    meet_analytic,
+    mesh_pdfs,
+    sum_rays,
+)
 from icheat_usd.lighting.sampler import LightSampler
-from icheat_usd.materials import evaluate, points_on_surface
-from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer, spawn_origins, transmittance
+from icheat_usd.materials import (
+    evaluate,
+    evaluate_specular,
+    is_glossy,
+    points_on_surface,
+    sample_specular,
+    shade_hits,
+    take_points,
+)
+from icheat_usd.scene import F32, F64, DeltaKind, Hits, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, spawn_points, transmittance
+from icheat_usd.tracing.paths import passing_materials
 
 # Rays in flight: enough to keep every thread busy, few enough for some tens of megabytes.
 _RAYS = 1 << 18
@@ -18,6 +36,9 @@ _RAYS = 1 << 18
 # A shadow ray stops short of an analytic light by this share of its length: such lights are often
 # authored in the plane of a ceiling, and they are not geometry that could stop it.
 _STOP_SHORT = np.float32(1.0 - 1e-4)
+
+# Surfaces that a specular ray goes through in search of mesh lights behind them.
+_LAYERS = 32
 
 
 def irradiance(
@@ -77,7 +98,9 @@ def reflected_direct(
         Without the emission of the points themselves. Delta surfaces reflect nothing here.
     """
     eye = np.require(to_eye, np.float32, ("C", "W"))
-    return _direct(snapshot, tracer, sampler, points, seed, n_samples, eye)
+    out = _direct(snapshot, tracer, sampler, points, seed, n_samples, eye)
+    _add_specular_rays(snapshot, tracer, sampler, points, eye, seed, max(int(n_samples), 1), out)
+    return out
 
 
 def _direct(
@@ -91,54 +114,229 @@ def _direct(
 ) -> F32:
     lights = snapshot.lights
     n = len(points.position)
+    n_samples = max(int(n_samples), 1)
     out = np.zeros((len(lights.kind), n, 3), np.float32)
-    for light, kind in enumerate(lights.kind):
-        single = kind == LightKind.DISTANT and lights.size[light, 0] <= 0.0
-        count = 1 if single else max(int(n_samples), 1)
+    for light in range(len(lights.kind)):
+        delta = _is_delta(snapshot, light)
+        count = 1 if delta else n_samples
         step = max(1, _RAYS // count)
         for first in range(0, n, step):
             part = slice(first, min(first + step, n))
-            chunk = _take(points, part)
+            chunk = _part(points, part)
             rays = _shadow_rays(snapshot, sampler, chunk, light, first, count, seed, to_eye is None)
             if not len(rays.point):
                 continue
             value = rays.radiance
             if to_eye is not None:
-                value = value * evaluate(_take(chunk, rays.point), to_eye[part][rays.point], rays.direction)
+                value = value * _response(chunk, to_eye[part], rays, None if delta else n_samples)
                 lit = np.flatnonzero(value.any(axis=1))
-                rays, value = rays.take(lit), np.ascontiguousarray(value[lit])
+                rays, value = rays.take(lit), value[lit]
             value = value * _visibility(snapshot, tracer, chunk, rays)
-            begin = np.searchsorted(rays.point, np.arange(len(chunk.position) + 1))
-            sum_rays(np.ascontiguousarray(value), begin, out[light, part])
+            _add(value, rays.point, out[light, part])
     return out
+
+
+def _is_delta(snapshot: SceneSnapshot, light: int) -> bool:
+    """Whether a light shines from exactly one direction, which no ray finds by chance."""
+    return bool(snapshot.lights.kind[light] == LightKind.DISTANT and snapshot.lights.size[light, 0] <= 0.0)
+
+
+def _n_specular(n_samples: int) -> int:
+    """Rays of the specular lobe per point, beside `n_samples` shadow rays per light; they serve all lights."""
+    return max(1, n_samples // 2)
+
+
+def _power_heuristic(this: F64, other: F64) -> F32:
+    """Weight (m, 1) of a technique with expected density `this` (Veach 1997, eq. 9.13)."""
+    return np.asarray(this * this / (this * this + other * other), np.float32)[:, None]
+
+
+def _add(values: F32, point: NDArray[np.int64], out: F32) -> None:
+    """Sum rays (m, 3), in the order of their points, into (n, 3)."""
+    begin = np.searchsorted(point, np.arange(len(out) + 1))
+    sum_rays(np.ascontiguousarray(values, np.float32), begin, out)
+
+
+def _response(chunk: SurfacePoints, to_eye: F32, rays: _ShadowRays, n_samples: int | None) -> F32:
+    """BRDF times cosine; the specular part weighted against specular rays if `n_samples` is given."""
+    points, eye = take_points(chunk, rays.point), to_eye[rays.point]
+    glossy = np.flatnonzero(is_glossy(points))
+    if n_samples is None or not len(glossy):
+        return evaluate(points, eye, rays.direction)
+    diffuse = points._replace(specular_edge=np.zeros_like(points.specular_edge))
+    value = evaluate(diffuse, eye, rays.direction)
+    points = take_points(points, glossy)
+    terms = evaluate_specular(points, eye[glossy], rays.direction[glossy])
+    weight = _power_heuristic(
+        n_samples * rays.pdf[glossy].astype(np.float64), _n_specular(n_samples) * terms.pdf.astype(np.float64)
+    )
+    lobe = points.specular * terms.base[:, None] + (points.specular_edge * terms.edge)[:, None]
+    value[glossy] += lobe * weight
+    return value
+
+
+def _add_specular_rays(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    points: SurfacePoints,
+    to_eye: F32,
+    seed: int,
+    n_samples: int,
+    out: F32,
+) -> None:
+    """Add what rays of the specular lobe find, weighted against the shadow rays of `_direct`."""
+    lights = snapshot.lights
+    glossy = np.flatnonzero(is_glossy(points))
+    shapes = [i for i, kind in enumerate(lights.kind) if kind != LightKind.MESH and not _is_delta(snapshot, i)]
+    has_meshes = bool((lights.kind == LightKind.MESH).any())
+    if not len(glossy) or not (shapes or has_meshes):
+        return
+    count = _n_specular(n_samples)
+    step = max(1, _RAYS // count)
+    for first in range(0, len(glossy), step):
+        chosen = glossy[first : first + step]
+        rays = _specular_rays(snapshot, points, to_eye, chosen, seed, count)
+        if not len(rays.owner):
+            continue
+        unblocked: F32 | None = None
+        for light in shapes:
+            m = len(rays.owner)
+            distance, pdf, radiance = np.zeros(m, np.float32), np.zeros(m), np.zeros((m, 3), np.float32)
+            place = (rays.points.position, rays.points.shading_normal, rays.direction)
+            meet_analytic(lights, snapshot.textures, sampler.tables, light, *place, distance, pdf, radiance)
+            if lights.kind[light] == LightKind.DOME:
+                if unblocked is None:
+                    unblocked = transmittance(snapshot, tracer, rays.origin, rays.direction, np.inf)
+                met = np.flatnonzero(radiance.any(axis=1) & unblocked.any(axis=1))
+                visible = unblocked[met]
+            else:
+                met = np.flatnonzero(radiance.any(axis=1))
+                visible = transmittance(
+                    snapshot, tracer, rays.origin[met], rays.direction[met], distance[met] * _STOP_SHORT
+                )
+            share = _power_heuristic(count * rays.pdf[met], n_samples * pdf[met])
+            value = rays.weight[met] * radiance[met] * visible * share
+            sums = np.zeros((len(chosen), 3), np.float32)
+            _add(value, rays.owner[met], sums)
+            out[light, chosen] += sums
+        if has_meshes:
+            for light, owner, value in _mesh_hits(snapshot, tracer, sampler, rays, count, n_samples):
+                sums = np.zeros((len(chosen), 3), np.float32)
+                _add(value, owner, sums)
+                out[light, chosen] += sums
+
+
+class _SpecularRays(NamedTuple):
+    owner: NDArray[np.int64]  #: (m,) ascending: row of the chosen points
+    points: SurfacePoints  #: (m,) where they start
+    origin: F32  #: (m, 3) off the surface
+    direction: F32  #: (m, 3) unit
+    pdf: F64  #: (m,) per solid angle
+    weight: F32  #: (m, 3) BRDF times cosine over pdf and number of rays
+
+
+def _specular_rays(
+    snapshot: SceneSnapshot, points: SurfacePoints, to_eye: F32, chosen: NDArray[np.int64], seed: int, count: int
+) -> _SpecularRays:
+    numbers = np.empty((len(chosen) * count, 2), np.float32)
+    fill_specular_numbers(chosen, count, seed & 0xFFFFFFFF, numbers)
+    owner = np.repeat(np.arange(len(chosen)), count)
+    starts, eye = take_points(points, chosen[owner]), to_eye[chosen[owner]]
+    direction, base, edge = sample_specular(starts, eye, numbers)
+    weight = (starts.specular * base[:, None] + (starts.specular_edge * edge)[:, None]) * np.float32(1.0 / count)
+    alive = np.flatnonzero(weight.any(axis=1))
+    starts, direction = take_points(starts, alive), np.ascontiguousarray(direction[alive])
+    pdf = evaluate_specular(starts, eye[alive], direction).pdf.astype(np.float64)
+    return _SpecularRays(owner[alive], starts, spawn_points(snapshot, starts, direction), direction, pdf, weight[alive])
+
+
+def _mesh_hits(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    rays: _SpecularRays,
+    count: int,
+    n_samples: int,
+) -> list[tuple[int, NDArray[np.int64], F32]]:
+    """What specular rays bring from mesh lights: light, owners (ascending) and values.
+
+    Light that shadow rays get straight through glass and holes must be found here too, so a ray goes on
+    behind what it hits as long as it might get through.
+    """
+    see_through = bool(passing_materials(snapshot.materials)[np.unique(snapshot.geometry.material)].any())
+    found: list[tuple[int, NDArray[np.int64], F32]] = []
+    ray = np.arange(len(rays.owner))
+    origin = rays.origin
+    for _ in range(_LAYERS if see_through else 1):
+        direction = np.ascontiguousarray(rays.direction[ray])
+        hits = tracer.intersect(origin, direction)
+        row = sampler.emissive_rows(hits.instance, hits.triangle)
+        lit = np.flatnonzero(row >= 0)
+        if len(lit):
+            found += _weigh_mesh_hits(snapshot, tracer, sampler, rays, ray[lit], row[lit], hits, lit, count, n_samples)
+        met = np.flatnonzero(hits.instance >= 0)
+        if not see_through or not len(met):
+            break
+        surface = shade_hits(snapshot, Hits._make(column[met] for column in hits), direction[met])
+        on = np.flatnonzero((surface.delta != DeltaKind.MIRROR) & (surface.opacity < 1.0))
+        ray, surface = ray[met[on]], take_points(surface, on)
+        if not len(ray):
+            break
+        origin = spawn_points(snapshot, surface, rays.direction[ray])
+    return found
+
+
+def _weigh_mesh_hits(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    rays: _SpecularRays,
+    ray: NDArray[np.int64],
+    row: NDArray[np.int64],
+    hits: Hits,
+    lit: NDArray[np.int64],
+    count: int,
+    n_samples: int,
+) -> list[tuple[int, NDArray[np.int64], F32]]:
+    lights = snapshot.lights
+    starts, direction = take_points(rays.points, ray), np.ascontiguousarray(rays.direction[ray])
+    ends = shade_hits(snapshot, Hits._make(column[lit] for column in hits), direction)
+    light = sampler.emissive_light[row]
+    pdf = np.zeros(len(row))
+    mesh_pdfs(lights, sampler.tables, light, row, starts.position, ends.position, pdf)
+    share = _power_heuristic(count * rays.pdf[ray], n_samples * pdf)
+    value = rays.weight[ray] * ends.emission * lights.radiance[light] * share
+    stop = spawn_points(snapshot, ends, -direction)
+    start = rays.origin[ray]
+    value = value * transmittance(snapshot, tracer, start, stop - start, 1.0)
+    return [(int(one), rays.owner[ray[light == one]], value[light == one]) for one in np.unique(light)]
 
 
 @dataclass(frozen=True, eq=False)
 class _ShadowRays:
     """Rays that can carry light, in the order of their points."""
 
-    point: I64  #: (m,) row of the chunk
+    point: NDArray[np.int64]  #: (m,) row of the chunk
     direction: F32  #: (m, 3) unit
     distance: F32  #: (m,)
     pdf: F32  #: (m,) per solid angle
     radiance: F32  #: (m, 3) over pdf and number of samples
-    end: F32 | None  #: (m, 3) point on geometry, for mesh lights
-    end_normal: F32 | None  #: (m, 3) turned to the receiver
+    end: SurfacePoints | None  #: (m,) on geometry, for mesh lights
 
-    def take(self, rows: I64) -> _ShadowRays:
+    def take(self, rows: NDArray[np.int64]) -> _ShadowRays:
         return _ShadowRays(
             self.point[rows],
             self.direction[rows],
             self.distance[rows],
             self.pdf[rows],
             self.radiance[rows],
-            None if self.end is None else self.end[rows],
-            None if self.end_normal is None else self.end_normal[rows],
+            None if self.end is None else take_points(self.end, rows),
         )
 
 
-def _take(points: SurfacePoints, rows: slice | I64) -> SurfacePoints:
-    return SurfacePoints._make(np.require(column[rows], None, ("C", "W")) for column in points)
+def _part(points: SurfacePoints, part: slice) -> SurfacePoints:
+    return SurfacePoints._make(np.require(column[part], None, ("C", "W")) for column in points)
 
 
 def _shadow_rays(
@@ -163,39 +361,26 @@ def _shadow_rays(
             snapshot.lights, snapshot.textures, sampler.tables, light, *place, direction, distance, pdf, radiance
         )
         rows = np.flatnonzero(radiance.any(axis=1))
-        return _ShadowRays(rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows], None, None)
+        return _ShadowRays(rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows], None)
 
     emissive = np.full(n, -1, np.int64)
     barycentric = np.zeros((n, 2), np.float32)
-    end = np.zeros((n, 3), np.float32)
-    end_normal = np.zeros((n, 3), np.float32)
-    side = np.zeros(n, np.uint8)
     fill_mesh(
-        snapshot.lights, sampler.tables, light, *place,
-        direction, distance, pdf, radiance, emissive, barycentric, end, end_normal, side,
+        snapshot.lights, sampler.tables, light, *place, direction, distance, pdf, radiance, emissive, barycentric
     )  # fmt: skip
     rows = np.flatnonzero(radiance.any(axis=1))
-    textured = rows[sampler.tables.triangle_textured[emissive[rows]] > 0]
-    if len(textured):
-        triangles = emissive[textured]
-        radiance[textured] *= points_on_surface(
-            snapshot,
-            snapshot.lights.triangle_instance[triangles],
-            snapshot.lights.triangle[triangles],
-            barycentric[textured],
-            side[textured],
-        ).emission
-        rows = rows[radiance[rows].any(axis=1)]
-    return _ShadowRays(
-        rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows], end[rows], end_normal[rows]
-    )
+    triangles = emissive[rows]
+    owner, triangle = snapshot.lights.triangle_instance[triangles], snapshot.lights.triangle[triangles]
+    end = points_on_surface(snapshot, owner, triangle, barycentric[rows], 0)  # both sides emit alike
+    rays = _ShadowRays(rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows] * end.emission, end)
+    dark = ~rays.radiance.any(axis=1)
+    return rays.take(np.flatnonzero(~dark)) if dark.any() else rays
 
 
 def _visibility(snapshot: SceneSnapshot, tracer: Tracer, chunk: SurfacePoints, rays: _ShadowRays) -> F32:
-    start = spawn_origins(chunk.position[rays.point], chunk.normal[rays.point], rays.direction)
-    if rays.end is None or rays.end_normal is None:
+    start = spawn_points(snapshot, take_points(chunk, rays.point), rays.direction)
+    if rays.end is None:
         return transmittance(snapshot, tracer, start, rays.direction, rays.distance * _STOP_SHORT)
     # both ends stand on geometry: offset the far one as well, or a mesh light shadows itself
-    stop = spawn_origins(rays.end, rays.end_normal, -rays.direction)
-    segment = np.ascontiguousarray(stop - start)
-    return transmittance(snapshot, tracer, start, segment, np.ones(len(segment), np.float32))
+    stop = spawn_points(snapshot, rays.end, -rays.direction)
+    return transmittance(snapshot, tracer, start, stop - start, 1.0)

@@ -9,7 +9,7 @@ import numpy as np
 from icheat_usd.kernels.environment import dome_columns_cdf
 from icheat_usd.kernels.lights import LightTables
 from icheat_usd.materials import points_on_surface
-from icheat_usd.scene import F32, F64, LightKind, Lights, SceneSnapshot, Texture
+from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, Texture
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec.709
 
@@ -26,10 +26,20 @@ class LightSampler:
     """Distributions over the texels of domes and the triangles of mesh lights of one snapshot."""
 
     tables: LightTables
+    emissive_key: I64  #: (n_emissive,) ascending: instance x number of triangles + triangle
+    emissive_row: I64  #: (n_emissive,) row of `Lights.triangle` with that key
+    emissive_light: I32  #: (n_emissive,) light that owns each row of `Lights.triangle`
+    n_triangles: int
 
-    @property
-    def n_lights(self) -> int:
-        return len(self.tables.determinant)
+    def emissive_rows(self, instance: I32, triangle: I32) -> I64:
+        """Rows of `Lights.triangle` that hits lie on, (n,); -1 where they are no light."""
+        row = np.full(len(instance), -1, np.int64)
+        if len(self.emissive_key):
+            key = instance.astype(np.int64) * self.n_triangles + triangle
+            place = np.minimum(np.searchsorted(self.emissive_key, key), len(self.emissive_key) - 1)
+            found = (instance >= 0) & (self.emissive_key[place] == key)
+            row[found] = self.emissive_row[place[found]]
+        return row
 
 
 def build_light_sampler(snapshot: SceneSnapshot) -> LightSampler:
@@ -47,9 +57,16 @@ def build_light_sampler(snapshot: SceneSnapshot) -> LightSampler:
     for light in np.flatnonzero(determinant > 0.0):
         to_local[light] = np.linalg.inv(linear[light])
     columns_begin, columns_cdf, rows_begin, rows_cdf = _dome_distributions(snapshot)
-    cdf, corners, emission, textured = _triangle_distributions(snapshot)
+    cdf, corners, emission = _triangle_distributions(snapshot)
+    n_triangles = len(snapshot.geometry.points)
+    key = lights.triangle_instance.astype(np.int64) * n_triangles + lights.triangle
+    order = np.argsort(key, kind="stable")
     return LightSampler(
-        LightTables(
+        emissive_key=key[order],
+        emissive_row=order,
+        emissive_light=np.repeat(np.arange(n, dtype=np.int32), np.diff(lights.triangle_begin)),
+        n_triangles=n_triangles,
+        tables=LightTables(
             to_local=to_local,
             determinant=determinant,
             columns_begin=columns_begin,
@@ -59,8 +76,7 @@ def build_light_sampler(snapshot: SceneSnapshot) -> LightSampler:
             triangle_cdf=cdf,
             triangle_corners=corners,
             triangle_emission=emission,
-            triangle_textured=textured,
-        )
+        ),
     )
 
 
@@ -94,16 +110,18 @@ def _dome_distributions(snapshot: SceneSnapshot) -> tuple[np.ndarray, F32, np.nd
     )
 
 
-def _triangle_distributions(snapshot: SceneSnapshot) -> tuple[F64, F64, F32, np.ndarray]:
+def _triangle_distributions(snapshot: SceneSnapshot) -> tuple[F64, F64, F32]:
     geometry, materials, lights = snapshot.geometry, snapshot.materials, snapshot.lights
     n = len(lights.triangle)
     if n == 0:
-        return np.zeros(1), np.zeros((1, 3, 3)), np.zeros((1, 3), np.float32), np.zeros(1, np.uint8)
+        return np.zeros(1), np.zeros((1, 3, 3)), np.zeros((1, 3), np.float32)
     to_world = geometry.instance_to_world[lights.triangle_instance].astype(np.float64)
     corners = np.einsum("nij,nkj->nki", to_world[:, :, :3], geometry.points[lights.triangle]) + to_world[:, None, :, 3]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
-    textured = materials.texture[geometry.material[lights.triangle], Texture.EMISSION] >= 0
+    used = materials.texture[geometry.material[lights.triangle]]
+    # a cut-out emits nothing in its holes, so its opacity makes the emission vary as well
+    textured = (used[:, Texture.EMISSION] >= 0) | (used[:, Texture.OPACITY] >= 0)
     emission = np.zeros((n, 3))
     for group, places in ((~textured, _PLACES[:1]), (textured, _PLACES)):
         rows = np.flatnonzero(group)
@@ -125,7 +143,7 @@ def _triangle_distributions(snapshot: SceneSnapshot) -> tuple[F64, F64, F32, np.
         if total > 0.0:
             cdf[part] = np.cumsum(weight) / total
             cdf[int(begin) + int(np.flatnonzero(weight)[-1]) : int(end)] = 1.0
-    return cdf, np.ascontiguousarray(corners), emission.astype(np.float32), textured.astype(np.uint8)
+    return cdf, np.ascontiguousarray(corners), emission.astype(np.float32)
 
 
 def _emission_at(snapshot: SceneSnapshot, rows: np.ndarray, place: F32) -> F32:
@@ -201,8 +219,3 @@ def _curved_area(kind: int, linear: F64, radius: float, length: float) -> float:
     x, y, z = linear
     cofactor = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)])
     return float(np.linalg.norm(normal @ cofactor.T, axis=-1).mean() * 4.0 * np.pi * radius**2)
-
-
-def lights_of_kind(lights: Lights, *kinds: LightKind) -> list[int]:
-    """Rows of `lights` of any of `kinds`, ascending."""
-    return [int(light) for light in np.flatnonzero(np.isin(lights.kind, [int(kind) for kind in kinds]))]

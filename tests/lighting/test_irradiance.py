@@ -33,7 +33,7 @@ SHEAR = np.array([[1, 0.4, 0, 0], [0, 1, 0.3, 0], [0.2, 0, 1, 0], [0, 0, 0, 1.0]
 
 
 def scene(*lights: Light, meshes: tuple[Mesh, ...] = ()) -> SceneSnapshot:
-    far_away = Mesh(quad(0.01, y=-1000.0))
+    far_away = Mesh(quad(0.01, y=-20.0))
     return make_snapshot([far_away, *meshes], lights=lights)
 
 
