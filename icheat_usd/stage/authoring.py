@@ -437,6 +437,7 @@ def set_edit(
     """
     prim = _writable_edit(stage, edit)
     written: list[str] = []
+    selections: list[EditFinding] = []
     with _writing(stage, layer) as target:
         if operation is not None or parameters:
             token = operation or str(schema.read_attribute(prim, schema.OPERATION, time))
@@ -454,9 +455,10 @@ def set_edit(
             _set(prim, schema.ENABLED, bool(enabled))
             written.append(schema.ENABLED)
         for collection, members in ((schema.RECEIVERS, receivers), (schema.CASTERS, casters)):
-            if members is not None:
-                _set_members(prim, collection, members)
-    return _overridden(prim, target, written, time)
+            if members is not None and not _set_members(prim, collection, members):
+                message = f"authored in {target.identifier}, but a stronger layer changes the selection"
+                selections.append(EditFinding(str(prim.GetPath()), collection, message))
+    return (*_overridden(prim, target, written, time), *selections)
 
 
 def mute_edit(stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, muted: bool = True) -> tuple[EditFinding, ...]:
@@ -578,19 +580,24 @@ def _checked_value(prim: Usd.Prim, parameter: schema.PropertySchema, value: Valu
     return type(expected)(*numbers)
 
 
-def _set_members(prim: Usd.Prim, name: str, members: Members | Sequence[str]) -> None:
+def _set_members(prim: Usd.Prim, name: str, members: Members | Sequence[str]) -> bool:
+    """Make a collection include and exclude just `members`; False if stronger layers keep it otherwise."""
     if isinstance(members, str):
         raise EditError(f"{prim.GetPath()} {name}: expected a list of paths, got the text '{members}'")
     wanted = members if isinstance(members, Members) else Members(tuple(members))
     collection = Usd.CollectionAPI(prim, name)
-    for relationship, names in (
-        (collection.GetIncludesRel(), wanted.includes),
-        (collection.GetExcludesRel(), wanted.excludes),
-    ):
-        _author_difference(relationship, collections.find_prims(prim.GetStage(), names, f"{prim.GetPath()} {name}"))
+    where = f"{prim.GetPath()} {name}"
+    includes = _author_difference(
+        collection.GetIncludesRel(), collections.find_prims(prim.GetStage(), wanted.includes, where)
+    )
+    excludes = _author_difference(
+        collection.GetExcludesRel(), collections.find_prims(prim.GetStage(), wanted.excludes, where)
+    )
+    return includes and excludes
 
 
-def _author_difference(relationship: Usd.Relationship, wanted: tuple[Sdf.Path, ...]) -> None:
+def _author_difference(relationship: Usd.Relationship, wanted: tuple[Sdf.Path, ...]) -> bool:
+    """Make the composed targets `wanted`; False if stronger layers keep them otherwise."""
     composed = relationship.GetTargets()
     for path in composed:
         if path not in wanted:
@@ -598,8 +605,7 @@ def _author_difference(relationship: Usd.Relationship, wanted: tuple[Sdf.Path, .
     for path in wanted:
         if path not in composed:
             _append(relationship, path)
-    if set(relationship.GetTargets()) != set(wanted):
-        raise EditError(f"{relationship.GetPath()}: a stronger layer decides the selection; author it there")
+    return set(relationship.GetTargets()) == set(wanted)
 
 
 # --------------------------------------------------------------------------- keys
