@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from icheat_usd.kernels.gather import cosine_directions
+from icheat_usd.kernels.gather import uniforms
 from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.samples import cosine_rays
 from icheat_usd.lighting import LightSampler, irradiance
-from icheat_usd.materials import effective_albedo
+from icheat_usd.materials import effective_albedo, take_points
 from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer, first_surfaces, spawn_origins
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
 INVERSE_PI = np.float32(1.0 / np.pi)
-
-
-def take(points: SurfacePoints, which: I64 | slice) -> SurfacePoints:
-    """Some of the points, as contiguous arrays."""
-    return SurfacePoints(*(np.ascontiguousarray(column[which]) for column in points))
 
 
 def trace_hemisphere(
@@ -33,16 +29,21 @@ def trace_hemisphere(
         pointed below the geometric surface.
     """
     n = len(stream)
-    directions = np.empty((n * n_rays, 3), np.float32)
-    cosine_directions(points.shading_normal, stream, n_rays, seed, directions)
-    positions = np.repeat(points.position, n_rays, axis=0)
-    normals = np.repeat(points.normal, n_rays, axis=0)
-    ends = first_surfaces(
-        snapshot, tracer, spawn_origins(positions, normals, directions), directions, int(hash_combine(seed, 1))
+    origins, directions = np.empty((n * n_rays, 3), np.float32), np.empty((n * n_rays, 3), np.float32)
+    cosine_rays(
+        spawn_points(snapshot, points, points.normal),
+        points.shading_normal,
+        points.normal,
+        np.arange(n + 1, dtype=np.int64),
+        n_rays,
+        seed,
+        stream,
+        np.empty(n * n_rays, np.int64),
+        origins,
+        directions,
     )
-    above = np.einsum("ij,ij->i", normals, directions) > 0
-    lit = above & (ends.points.instance >= 0)
-    return ends.points, np.where(lit[:, None], ends.throughput, np.float32(0))
+    ends = first_surfaces(snapshot, tracer, origins, directions, int(hash_combine(seed, 1)))
+    return ends.points, ends.throughput
 
 
 def reflected_radiance(
@@ -74,7 +75,7 @@ def reflected_radiance(
     result = np.zeros_like(throughput)
     alive = np.flatnonzero(throughput.any(axis=1))
     carried = throughput[alive]
-    points = take(points, alive)
+    points = take_points(points, alive)
     for bounce in range(n_bounces):
         if len(alive) == 0:
             break
@@ -87,22 +88,13 @@ def reflected_radiance(
         carried = carried * albedo
         # Survival by the reflectance of this vertex alone: the paths that carry most light live longest.
         survival = np.clip(albedo.max(axis=1), np.float32(0.05), np.float32(0.95))
-        lives = np.flatnonzero(_uniforms(step_seed, alive) < survival)
-        alive, points = alive[lives], take(points, lives)
+        chance = np.empty(len(alive), np.float32)
+        uniforms(step_seed, alive, chance)
+        lives = np.flatnonzero(chance < survival)
+        alive, points = alive[lives], take_points(points, lives)
         carried = carried[lives] / survival[lives, None]
         points, through = trace_hemisphere(snapshot, tracer, points, alive, 1, int(hash_combine(step_seed, 2)))
         carried = carried * through
         lives = np.flatnonzero(carried.any(axis=1))
-        alive, carried, points = alive[lives], carried[lives], take(points, lives)
+        alive, carried, points = alive[lives], carried[lives], take_points(points, lives)
     return result
-
-
-def _uniforms(seed: int, index: I64) -> F32:
-    """Uniform numbers in [0, 1) that depend on (seed, index) alone; PCG hash as in `kernels.random`."""
-    with np.errstate(over="ignore"):
-        x = index.astype(np.uint32) ^ np.uint32(seed)
-        for _ in range(2):
-            state = x * np.uint32(747796405) + np.uint32(2891336453)
-            word = ((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
-            x = (word >> np.uint32(22)) ^ word
-    return (x >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)

@@ -18,16 +18,16 @@ import numpy as np
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_radiance
 from icheat_usd.errors import EditError
-from icheat_usd.final_gather.hits import reflected_radiance, take, trace_hemisphere
-from icheat_usd.kernels.gather import point_sets
+from icheat_usd.final_gather.hits import reflected_radiance, trace_hemisphere
 from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.transport import point_sets
 from icheat_usd.lighting import LightSampler, build_light_sampler, reflected_direct
-from icheat_usd.materials import is_glossy, sample_specular
+from icheat_usd.materials import is_glossy, sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
 from icheat_usd.samples.develop import average, develop
 from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer, first_surfaces, spawn_origins
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
 #: Gather rays in flight; bounds memory and keeps a chunk's arrays near the caches.
 RAYS_AT_ONCE = 1 << 19
@@ -118,25 +118,25 @@ def final_gather(
     gatherer = _Gatherer(
         snapshot, tracer, build_light_sampler(snapshot), field, incident, gather, gather_radiance, settings
     )
-    totals: dict[str, F64] = {}
-    for index in range(settings.samples_per_pixel):
-        progress("gather", index / settings.samples_per_pixel)
+    n_pixels = snapshot.camera.width * snapshot.camera.height
+    band = max(RAYS_AT_ONCE // (settings.samples_per_pixel * max(settings.gather_rays, 1)), 1)
+    bands: list[dict[str, F64]] = []
+    for first in range(0, n_pixels, band):
+        progress("gather", first / n_pixels)
+        pixels = (first, min(first + band, n_pixels))
         view = view_samples(
             snapshot,
             tracer,
             samples_per_pixel=settings.samples_per_pixel,
             seed=settings.seed,
-            only_sample=index,
             max_splits=0,
+            pixels=pixels,
         )
-        share = (index + np.array([0.0, 1.0])) / settings.samples_per_pixel
-        for name, values in _one_sample(gatherer, view, index, share, progress).items():
-            totals[name] = totals[name] + values if name in totals else values
+        bands.append(_band(gatherer, view, pixels, int(hash_combine(settings.seed, first))))
     progress("gather", 1.0)
-    n = settings.samples_per_pixel
-    for name in ("albedo", "normal", "depth"):
-        totals[name] /= n
-    return FinalGather(**totals)
+    shape = (snapshot.camera.height, snapshot.camera.width, -1)
+    layers = {name: np.concatenate([part[name] for part in bands]).reshape(shape) for name in bands[0]}
+    return FinalGather(**layers)
 
 
 def _incident_from(gather: GatherSamples, radiance: F32) -> IncidentColor:
@@ -146,37 +146,27 @@ def _incident_from(gather: GatherSamples, radiance: F32) -> IncidentColor:
     return color
 
 
-def _one_sample(
-    gatherer: _Gatherer, view: ViewSamples, index: int, share: F64, progress: Progress
-) -> dict[str, F64]:
-    """One camera sample of every pixel, as image layers."""
-    settings = gatherer.settings
-    seed = int(hash_combine(settings.seed, 1000 + index))
-    base = np.zeros((view.n, 3), np.float32)
-    edited = np.zeros((view.n, 3), np.float32)
-    direct = np.zeros((view.n, 3), np.float32)
-    step = max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
-    for begin in range(0, view.n, step):
-        progress("gather", float(share[0] + (share[1] - share[0]) * begin / max(view.n, 1)))
-        some = slice(begin, min(begin + step, view.n))
-        points = take(view.points, some)
-        to_eye = np.ascontiguousarray(view.to_eye[some])
-        stream = np.arange(some.start, some.stop, dtype=np.int64)
-        chunk_seed = int(hash_combine(seed, begin))
-        direct[some] = reflected_direct(
-            gatherer.snapshot, gatherer.tracer, gatherer.sampler, points, to_eye, chunk_seed, settings.light_samples
-        ).sum(axis=0)
-        light = _indirect(gatherer, points, to_eye, stream, chunk_seed)
-        base[some], edited[some] = light.base, light.edited
+def _band(gatherer: _Gatherer, view: ViewSamples, pixels: tuple[int, int], seed: int) -> dict[str, F64]:
+    """Layers of some of the pixels, (n_pixels, k) each."""
+    direct = reflected_direct(
+        gatherer.snapshot,
+        gatherer.tracer,
+        gatherer.sampler,
+        view.points,
+        view.to_eye,
+        seed,
+        gatherer.settings.light_samples,
+    ).sum(axis=0)
+    light = _indirect(gatherer, view.points, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
     return {
-        "background": view.background.reshape(view.height, view.width, 3).astype(np.float64),
-        "emission": develop(view, view.points.emission),
-        "direct": develop(view, direct),
-        "indirect": develop(view, base),
-        "indirect_edited": develop(view, edited),
-        "albedo": average(view, view.points.albedo),
-        "normal": average(view, view.points.shading_normal),
-        "depth": average(view, view.depth[:, None]),
+        "background": view.background[slice(*pixels)].astype(np.float64),
+        "emission": develop(view, view.points.emission, pixels),
+        "direct": develop(view, direct, pixels),
+        "indirect": develop(view, light.base, pixels),
+        "indirect_edited": develop(view, light.edited, pixels),
+        "albedo": average(view, view.points.albedo, pixels),
+        "normal": average(view, view.points.shading_normal, pixels),
+        "depth": average(view, view.depth[:, None], pixels),
     }
 
 
@@ -191,7 +181,7 @@ def _indirect(gatherer: _Gatherer, points: SurfacePoints, to_eye: F32, stream: I
     edited = points.albedo * diffuse.edited
     glossy = np.flatnonzero(is_glossy(points))
     if len(glossy):
-        specular = _specular(gatherer, take(points, glossy), to_eye[glossy], stream[glossy], receiver[:, glossy], touched[glossy], seed)
+        specular = _specular(gatherer, take_points(points, glossy), to_eye[glossy], stream[glossy], receiver[:, glossy], touched[glossy], seed)
         base[glossy] += specular.base
         edited[glossy] += specular.edited
     if gatherer.field.has_offset and touched.any():
@@ -216,13 +206,13 @@ def _specular(
     """The specular lobe's share, by rays that follow the lobe."""
     n_rays = gatherer.settings.gather_rays
     seed = int(hash_combine(seed, 7))
-    repeated = SurfacePoints(*(np.repeat(column, n_rays, axis=0) for column in points))
+    repeated = take_points(points, np.repeat(np.arange(len(stream)), n_rays))
     u = _lobe_numbers(stream, n_rays, seed)
     directions, base_weight, edge_weight = sample_specular(repeated, np.repeat(to_eye, n_rays, axis=0), u)
     ends = first_surfaces(
         gatherer.snapshot,
         gatherer.tracer,
-        spawn_origins(repeated.position, repeated.normal, directions),
+        spawn_points(gatherer.snapshot, repeated, directions),
         directions,
         int(hash_combine(seed, 1)),
     )
@@ -234,7 +224,7 @@ def _specular(
 
 def _lobe_numbers(stream: I64, n_rays: int, seed: int) -> F32:
     out = np.empty((len(stream) * n_rays, 2), np.float32)
-    point_sets(stream, n_rays, seed, out)
+    point_sets(seed, stream, n_rays, out)
     return out
 
 
@@ -255,7 +245,7 @@ def _sum_rays(
     edited = base.copy()
     rays = np.flatnonzero(np.repeat(touched, n_rays) & through.any(axis=1))
     if len(rays):
-        some = take(hits, rays)
+        some = take_points(hits, rays)
         caster = gatherer.field.caster_masks(some)
         color = np.zeros((len(rays), 3), np.float32)
         if gatherer.incident_color is not None:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icheat_usd.edits.field import EditField
-from icheat_usd.scene import F32, I64
 from icheat_usd.samples import ViewSamples
+from icheat_usd.scene import F32, I64
 
 #: An edited copy of the radiance costs about as much as this many rows evaluated pair by pair.
 SMALLEST_GROUP = 64

@@ -14,10 +14,10 @@ from icheat_usd.kernels.relight import multiply_rows
 from icheat_usd.lighting import build_light_sampler, reflected_direct
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight.receivers import Receivers, group_receivers
-from icheat_usd.samples import GatherSamples, ViewSamples
+from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct
 from icheat_usd.scene import F32, I32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
-from icheat_usd.transport import SparseRows, Transport, cell_direct, solve_bounces
+from icheat_usd.transport import SparseRows, Transport, solve_bounces
 
 #: View samples evaluated pair by pair at once; bounds the memory of a relight.
 SAMPLES_AT_ONCE = 4096

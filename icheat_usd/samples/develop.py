@@ -8,27 +8,30 @@ from icheat_usd.samples.view import ViewSamples
 from icheat_usd.scene import F32, F64
 
 
-def develop(view: ViewSamples, radiance: F32) -> F64:
+def develop(view: ViewSamples, radiance: F32, pixels: tuple[int, int] | None = None) -> F64:
     """Sum what the view samples send to the eye into pixels.
 
     Parameters
     ----------
     radiance : (n_view, 3) float32, scene-linear
+    pixels : (first, behind the last), optional
+        Part of the image, row-major, that holds all the samples; the whole image by default.
 
     Returns
     -------
-    (height, width, 3) float64
+    (n_pixels, 3) float64
         Summed serially in the order of the samples.
     """
-    seen = view.throughput * radiance
-    n = view.width * view.height
-    channels = [np.bincount(view.pixel, seen[:, channel], n) for channel in range(3)]
-    return np.stack(channels, axis=1).reshape(view.height, view.width, 3)
+    return _sums(view, view.throughput * radiance, pixels)
 
 
-def average(view: ViewSamples, values: F32) -> F64:
-    """Mean of an attribute (n_view, k) over each pixel's view samples, 0 where there are none: (height, width, k)."""
-    n = view.width * view.height
-    counts = np.maximum(np.bincount(view.pixel, minlength=n), 1)
-    channels = [np.bincount(view.pixel, values[:, channel], n) / counts for channel in range(values.shape[1])]
-    return np.stack(channels, axis=1).reshape(view.height, view.width, -1)
+def average(view: ViewSamples, values: F32, pixels: tuple[int, int] | None = None) -> F64:
+    """Mean of an attribute (n_view, k) over each pixel's view samples, 0 where there are none: (n_pixels, k)."""
+    counts = _sums(view, np.ones((view.n, 1), np.float32), pixels)
+    return _sums(view, values, pixels) / np.maximum(counts, 1)
+
+
+def _sums(view: ViewSamples, values: F32, pixels: tuple[int, int] | None) -> F64:
+    first, end = pixels or (0, view.width * view.height)
+    place = view.pixel - first
+    return np.stack([np.bincount(place, column, end - first) for column in values.T], axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,7 +52,8 @@ class _Paths(NamedTuple):
     splits: I32  # how often this path was divided so far
 
     def take(self, rows: I64) -> _Paths:
-        return _Paths(*(np.ascontiguousarray(column[rows]) for column in self))
+        columns: tuple[Any, ...] = self
+        return _Paths(*(np.ascontiguousarray(column[rows]) for column in columns))
 
 
 class _Found(NamedTuple):
@@ -66,7 +67,13 @@ class _Found(NamedTuple):
 
 
 def view_samples(
-    snapshot: SceneSnapshot, tracer: Tracer, *, samples_per_pixel: int = 1, seed: int = 0, max_splits: int = 2
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    *,
+    samples_per_pixel: int = 1,
+    seed: int = 0,
+    max_splits: int = 2,
+    pixels: tuple[int, int] | None = None,
 ) -> ViewSamples:
     """Trace the camera's rays to the points that it sees.
 
@@ -81,6 +88,9 @@ def view_samples(
         stratified over the pixel (box filter) and the lens.
     max_splits
         Divisions of one path; where more would follow, one continuation is chosen at random.
+    pixels
+        First pixel and the one behind the last, row-major, of a part of the
+        image; the whole image by default.
 
     Raises
     ------
@@ -94,8 +104,9 @@ def view_samples(
     background = np.zeros((n_pixels, 3), np.float64)
     found: list[_Found] = []
     at_once = max(1, _RAYS_AT_ONCE // samples_per_pixel)
-    for first in range(0, n_pixels, at_once):
-        n = (min(first + at_once, n_pixels) - first) * samples_per_pixel
+    begin, end = (0, n_pixels) if pixels is None else pixels
+    for first in range(begin, end, at_once):
+        n = (min(first + at_once, end) - first) * samples_per_pixel
         paths, limit = _camera_paths(snapshot, first, n, samples_per_pixel, seed)
         found += _follow(
             snapshot, tracer, paths, limit, int(hash_combine(seed & 0xFFFFFFFF, first)), max_splits, background

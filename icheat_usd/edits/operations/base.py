@@ -61,6 +61,10 @@ class Operation(ABC):
     def evaluate(self, parameters: Mapping[str, Value], pairs: Pairs) -> PairCoefficients:
         """Coefficients of every pair; `parameters` is complete and checked."""
 
+    def constant_delta(self, parameters: Mapping[str, Value]) -> tuple[float, float, float] | None:
+        """RGB of scale - 1 if it is the same for all pairs, to bake for readers that do not know the operation."""
+        return None
+
     def complete(self, given: Mapping[str, Value], where: str) -> dict[str, Value]:
         """Fill in defaults and check `given`.
 

@@ -23,3 +23,7 @@ class Scale(Operation):
     def evaluate(self, parameters: Mapping[str, Value], pairs: Pairs) -> PairCoefficients:
         color = np.asarray(parameters["color"], np.float32)
         return PairCoefficients(scale=(np.float32(parameters["gain"]) * color)[None, :])
+
+    def constant_delta(self, parameters: Mapping[str, Value]) -> tuple[float, float, float]:
+        red, green, blue = self.evaluate(parameters, Pairs(np.zeros((1, 3), np.float32))).scale[0]
+        return float(red - 1), float(green - 1), float(blue - 1)

@@ -1,63 +1,29 @@
-"""An open document: a stage, a camera, a time and an edit stack, and what is computed from them.
-
-    session = Session.open("shot.usda", camera="/World/Camera", frame=12)
-    session.add_edit("warm", layer="shot.usda", operation="scale", parameters={"color": (1.4, 1.1, 0.8)},
-                     receivers=["/World/Figure"], casters=["/World/Room/Wall"])
-    write_exr(session.relight(), "preview.exr")
-    write_exr(session.render(), "final.exr")
-
-Nothing is computed before it is asked for, and each part is kept: a second
-relight after an edit costs no ray.
-"""
+"""An open document: a stage, a camera, a time and an edit stack, and what is computed from them."""
 
 from __future__ import annotations
 
-import datetime
-import hashlib
-import io
-import platform
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from icheat_usd import __version__
-from icheat_usd.edits.field import EditField, bind
-from icheat_usd.edits.model import EMPTY_STACK, EditStack, Payload, SurfaceMask, Value
+from icheat_usd.edits.field import bind
+from icheat_usd.edits.model import EMPTY_STACK, Blend, EditStack, SurfaceMask, Value
 from icheat_usd.edits.painting import Brush, paint_mask
-from icheat_usd.errors import EditError
-from icheat_usd.final_gather import FinalGather, GatherSettings, final_gather
+from icheat_usd.final_gather import GatherSettings, final_gather
 from icheat_usd.image.film import Film
 from icheat_usd.progress import Progress, silent
-from icheat_usd.relight import Relighter, RelitView, build_relighter
+from icheat_usd.relight import Relighter, build_relighter
 from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
-from icheat_usd.samples.develop import average, develop
-from icheat_usd.scene import F32, F64, Finding, SceneSnapshot
+from icheat_usd.scene import Finding, SceneSnapshot
+from icheat_usd.session import authoring, films
+from icheat_usd.session.quality import Quality
+from icheat_usd.stage import open_stage, take_snapshot
+from icheat_usd.stage.authoring import Members
+from icheat_usd.stage.edit_stack import find_stack, read_edit_stack
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import Transport, build_transport
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Effort of the preview.
-
-    The defaults suit a 640 x 480 frame: 65,536 gather samples and 256 rays a row.
-    """
-
-    n_gather: int = 65_536
-    rays_per_row: int = 256
-    rays_per_bounce_row: int = 128
-    row_spacing: int = 1  #: pixels between the points where rows are kept; the rest is interpolated
-    light_samples: int = 16  #: shadow rays per light and point
-    n_bounces: int = 16  #: diffuse reflections before the last one
-    samples_per_pixel: int = 1
-    seed: int = 0
-
-
-DRAFT = Quality(n_gather=8_192, rays_per_row=64, rays_per_bounce_row=64, row_spacing=4, light_samples=8)
 
 
 class Session:
@@ -124,7 +90,7 @@ class Session:
             The stage, the camera or the frame cannot be used.
         """
         if isinstance(stage, (str, Path)):
-            stage = stage_io.open_stage(stage)
+            stage = open_stage(stage)
         return cls(
             stage,
             camera=camera,
@@ -143,7 +109,7 @@ class Session:
     def snapshot(self) -> SceneSnapshot:
         """The stage at the session's frame."""
         width, height = self._size
-        return stage_io.take_snapshot(
+        return take_snapshot(
             self.stage, camera=self.camera, time=self.frame, width=width, height=height, progress=self.progress
         )
 
@@ -199,11 +165,11 @@ class Session:
     # Edits
 
     def _read_stack(self) -> tuple[EditStack, tuple[Finding, ...]]:
-        path = stage_io.find_stack(self.stage, self._stack_path, self.camera)
+        path = find_stack(self.stage, self._stack_path, self.camera)
         if path is None:
             return EMPTY_STACK, ()
         surfaces = {surface.path for surface in self.snapshot.surfaces}
-        stack, findings = stage_io.read_edit_stack(self.stage, path, self.frame, surfaces, read_payload)
+        stack, findings = read_edit_stack(self.stage, path, self.frame, surfaces, authoring.read_payload)
         return stack, tuple(findings)
 
     @property
@@ -229,7 +195,7 @@ class Session:
         stack = self.stack
         field = bind(stack, self.snapshot)
         relighter = self.relighter
-        return self._relit_film(relighter.relight(field), stack)
+        return films.relit_film(self.view, relighter.relight(field), self.metadata("relight", stack, asdict(self.quality)))
 
     def render(self, settings: GatherSettings = GatherSettings()) -> Film:
         """Final frame by gathering at every camera sample; same layers as `relight`."""
@@ -247,75 +213,100 @@ class Session:
             gather_radiance=radiance,
             progress=self.progress,
         )
-        return self._final_film(result, stack, settings)
+        return films.final_film(result, self.metadata("final gather", stack, asdict(settings)))
 
-    def _relit_film(self, light: RelitView, stack: EditStack) -> Film:
-        view = self.view
-        seen = view.background.reshape(view.height, view.width, 3) + develop(view, view.points.emission)
-        return _film(
-            view.width,
-            view.height,
-            direct=seen + develop(view, light.direct),
-            indirect=develop(view, light.indirect),
-            indirect_edited=develop(view, light.indirect_edited),
-            albedo=average(view, view.points.albedo),
-            normal=average(view, view.points.shading_normal),
-            depth=average(view, view.depth[:, None]),
-            metadata=self._metadata("relight", stack, asdict(self.quality)),
+    def metadata(self, renderer: str, stack: EditStack, settings: Mapping[str, Any]) -> dict[str, str]:
+        """What made an image, for its file."""
+        return films.image_metadata(self.snapshot, renderer, stack, settings)
+
+    # Authoring: opinions in one layer, payloads in a new sidecar beside it
+
+    @property
+    def stack_path(self) -> str | None:
+        """Prim path of the edit stack, None if the stage has none."""
+        return find_stack(self.stage, self._stack_path, self.camera)
+
+    def add_edit(
+        self,
+        name: str,
+        *,
+        layer: str,
+        operation: str = "scale",
+        parameters: Mapping[str, Value] | None = None,
+        receivers: Members | Sequence[str] = (),
+        casters: Members | Sequence[str] = (),
+        amount: float = 1.0,
+        blend: Blend | str = Blend.COMPOSE,
+        receiver_brush: Brush | None = None,
+        caster_brush: Brush | None = None,
+        frame: float | None = None,
+        before: str | None = None,
+        after: str | None = None,
+    ) -> str:
+        """Add an edit to the stack and save the layer; a stack is made if the stage has none.
+
+        Parameters
+        ----------
+        name : str
+            Name of the edit's prim.
+        layer : str
+            Layer of the stage's layer stack to write to, or "session".
+        receivers, casters : paths or Members
+            Prims that get, and prims that send, the edited light.
+        receiver_brush, caster_brush : Brush, optional
+            Soft weights by position, painted on the selected surfaces; see `edits.painting`.
+        frame : float, optional
+            Time of the key; without it the edit holds at all times.
+
+        Returns
+        -------
+        str
+            Path of the edit.
+
+        Raises
+        ------
+        EditError, SidecarError
+            Something named does not exist or cannot be written; the layer is then as before.
+        """
+        stack = self.stack_path or authoring.create_stack(self.stage, None, layer=layer, camera=self.camera)
+        return authoring.add_edit(
+            self.stage,
+            stack,
+            name,
+            layer=layer,
+            operation=operation,
+            parameters=parameters or {},
+            receivers=receivers,
+            casters=casters,
+            amount=amount,
+            blend=blend,
+            receiver_mask=self._paint(receivers, receiver_brush),
+            caster_mask=self._paint(casters, caster_brush),
+            made_against=self._made_against,
+            frame=frame,
+            before=before,
+            after=after,
         )
 
-    def _final_film(self, result: FinalGather, stack: EditStack, settings: GatherSettings) -> Film:
-        height, width, _ = result.indirect.shape
-        return _film(
-            width,
-            height,
-            direct=result.background + result.emission + result.direct,
-            indirect=result.indirect,
-            indirect_edited=result.indirect_edited,
-            albedo=result.albedo,
-            normal=result.normal,
-            depth=result.depth,
-            metadata=self._metadata("final gather", stack, asdict(settings)),
-        )
+    def _paint(self, selected: Members | Sequence[str], brush: Brush | None) -> SurfaceMask | None:
+        if brush is None:
+            return None
+        members = selected if isinstance(selected, Members) else Members(tuple(selected))
+        paths = authoring.surfaces_below(self.stage, members, [s.path for s in self.snapshot.surfaces])
+        return paint_mask(self.snapshot, paths, brush)
 
-    def _metadata(self, renderer: str, stack: EditStack, settings: Mapping[str, Any]) -> dict[str, str]:
-        snapshot = self.snapshot
-        return {
-            "stage": snapshot.stage_path,
-            "camera": snapshot.camera.path,
-            "frame": "default" if snapshot.time_code is None else f"{snapshot.time_code:g}",
-            "renderer": renderer,
-            "settings": ", ".join(f"{name}={value}" for name, value in settings.items()),
-            "stack": stack.path,
-            "stackDigest": stack.digest,
-            "edits": ", ".join(edit.path for edit in stack.active),
-            "colorSpace": "lin_rec709_scene",
-            "version": __version__,
-            "software": f"icheat_usd {__version__}, Python {platform.python_version()}, NumPy {np.__version__}",
-        }
+    @property
+    def _made_against(self) -> dict[str, str | float | int]:
+        """Only what is known without work: an edit without masks must not cost a snapshot."""
+        if "snapshot" not in self.__dict__:
+            return {}
+        camera = self.snapshot.camera
+        return {"camera": camera.path, "width": camera.width, "height": camera.height}
 
+    def set_edit(self, edit: str, *, layer: str, **values: Any) -> tuple[Finding, ...]:
+        """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`."""
+        return authoring.set_edit(self.stage, edit, layer=layer, **values)
 
-def _film(
-    width: int,
-    height: int,
-    *,
-    direct: F64,
-    indirect: F64,
-    indirect_edited: F64,
-    albedo: F64,
-    normal: F64,
-    depth: F64,
-    metadata: Mapping[str, str],
-) -> Film:
-    layers = {
-        "beauty": direct + indirect_edited,
-        "direct": direct,
-        "indirect": indirect,
-        "indirect_edited": indirect_edited,
-        "edit_delta": indirect_edited - indirect,
-        "albedo": albedo,
-        "normal": normal,
-        "depth": depth[..., 0],
-    }
-    pixels = {name: np.ascontiguousarray(values, np.float32) for name, values in layers.items()}
-    return Film(width, height, pixels, metadata)
+    def mute_edit(self, edit: str, *, layer: str, muted: bool = True) -> tuple[Finding, ...]:
+        """Mute or unmute an edit in one layer and save it."""
+        return authoring.set_edit(self.stage, edit, layer=layer, enabled=not muted)

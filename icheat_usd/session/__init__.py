@@ -1,0 +1,35 @@
+"""An open document without a window: what scripts, the shell and user interfaces talk to.
+
+    session = Session.open("shot.usda", camera="/World/Camera", frame=12)
+    session.add_edit("warm", layer="shot.usda", operation="scale", parameters={"color": (1.4, 1.1, 0.8)},
+                     receivers=["/World/Figure"], casters=["/World/Room/Wall"])
+    write_exr(session.relight(), "preview.exr")
+    write_exr(session.render(), "final.exr")
+"""
+
+from icheat_usd.edits.painting import soft_sphere
+from icheat_usd.final_gather import GatherSettings
+from icheat_usd.session.authoring import (
+    add_edit,
+    create_stack,
+    move_edit,
+    mute_edit,
+    remove_edit,
+    set_edit,
+)
+from icheat_usd.session.document import Session
+from icheat_usd.session.quality import DRAFT, Quality
+
+__all__ = [
+    "DRAFT",
+    "GatherSettings",
+    "Quality",
+    "Session",
+    "add_edit",
+    "create_stack",
+    "move_edit",
+    "mute_edit",
+    "remove_edit",
+    "set_edit",
+    "soft_sphere",
+]

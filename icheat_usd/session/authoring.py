@@ -1,0 +1,175 @@
+"""Edits written for good: a new sidecar for the payload, opinions in one layer, and the layer saved.
+
+The order is what keeps a crash harmless: the sidecar first, which no one
+refers to yet, then the layer that names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from icheat_usd.edits import operations
+from icheat_usd.edits.model import Blend, Payload, SurfaceMask, Value
+from icheat_usd.errors import EditError
+from icheat_usd.scene import Finding
+from icheat_usd.sidecar import read_payload as read_sidecar
+from icheat_usd.sidecar import write_payloads
+from icheat_usd.stage import authoring
+from icheat_usd.stage.authoring import Members
+
+
+def read_payload(file: str, source: str | bytes, digest: str, anchor: str) -> Payload:
+    """Read one payload for `stage.edit_stack.read_edit_stack`."""
+    return read_sidecar(source, digest, anchor=anchor, name=file)
+
+
+def create_stack(stage: Any, path: str | None, *, layer: str, camera: str | None = None) -> str:
+    """Make an edit stack and save the layer; without a path it is ``<default prim>/Edits``.
+
+    Raises
+    ------
+    EditError
+        The stage has no default prim to put it under, or the layer refuses.
+    """
+    if path is None:
+        default = stage.GetDefaultPrim()
+        if not default:
+            name = stage.GetRootLayer().identifier
+            raise EditError(f"{name} has no default prim to hold the edit stack; set defaultPrim, or name the stack")
+        path = f"{default.GetPath()}/Edits"
+    stack = authoring.create_stack(stage, path, layer=layer, camera=camera)
+    _save(stage, layer)
+    return stack
+
+
+def add_edit(
+    stage: Any,
+    stack: str,
+    name: str,
+    *,
+    layer: str,
+    operation: str = "scale",
+    parameters: Mapping[str, Value] | None = None,
+    receivers: Members | Sequence[str] = (),
+    casters: Members | Sequence[str] = (),
+    amount: float = 1.0,
+    blend: Blend | str = Blend.COMPOSE,
+    receiver_mask: SurfaceMask | None = None,
+    caster_mask: SurfaceMask | None = None,
+    made_against: Mapping[str, str | float | int] | None = None,
+    frame: float | None = None,
+    before: str | None = None,
+    after: str | None = None,
+    sidecar: str | Path | None = None,
+) -> str:
+    """Add an edit with its payload to a stack and save the layer.
+
+    Parameters
+    ----------
+    sidecar : path, optional
+        Folder or file for the payload; beside the layer's file by default. Needed for layers without a file.
+
+    Raises
+    ------
+    EditError, SidecarError
+        Something named does not exist or cannot be written. The layer is then
+        as before, and no sidecar is left behind.
+    """
+    parameters = parameters or {}
+    target = authoring.find_layer(stage, layer)
+    payload = Payload(
+        operation=operation,
+        parameters=dict(parameters),
+        receiver_mask=receiver_mask,
+        caster_mask=caster_mask,
+        scale_delta=_baked(operation, parameters, f"{stack}/{name}"),
+        made_against=made_against or {},
+    )
+    beside = sidecar or target.realPath
+    written: tuple[Path, str] | None = None
+    if beside:
+        file, digests = write_payloads(beside, [payload], anchor=_anchor(stage))
+        written = (file, digests[0])
+    elif receiver_mask is not None or caster_mask is not None:
+        raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
+    try:
+        path = authoring.add_edit(
+            stage,
+            stack,
+            name,
+            layer=target,
+            operation=operation,
+            parameters=parameters,
+            receivers=receivers,
+            casters=casters,
+            amount=amount,
+            blend=blend,
+            payload=written,
+            time=frame,
+            before=before,
+            after=after,
+        )
+        _save(stage, layer)
+    except BaseException:
+        if written is not None:
+            written[0].unlink(missing_ok=True)
+        raise
+    return path
+
+
+def set_edit(stage: Any, edit: str, *, layer: str, **values: Any) -> tuple[Finding, ...]:
+    """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`."""
+    findings = authoring.set_edit(stage, edit, layer=layer, **values)
+    _save(stage, layer)
+    return findings
+
+
+def mute_edit(stage: Any, edit: str, *, layer: str, muted: bool = True) -> tuple[Finding, ...]:
+    """Mute or unmute an edit in one layer and save it."""
+    return set_edit(stage, edit, layer=layer, enabled=not muted)
+
+
+def move_edit(
+    stage: Any, stack: str, edit: str, *, layer: str, before: str | None = None, after: str | None = None
+) -> None:
+    """Move an edit within its stack and save the layer; see `stage.authoring.move_edit`."""
+    authoring.move_edit(stage, stack, edit, layer=layer, before=before, after=after)
+    _save(stage, layer)
+
+
+def remove_edit(stage: Any, stack: str, edit: str, *, layer: str) -> None:
+    """Take an edit out of a stack and save the layer; see `stage.authoring.remove_edit`."""
+    authoring.remove_edit(stage, stack, edit, layer=layer)
+    _save(stage, layer)
+
+
+def surfaces_below(stage: Any, members: Members, paths: Iterable[str]) -> list[str]:
+    """Those of the surface paths that lie at or below a member and not below an exclusion."""
+    default = stage.GetDefaultPrim()
+    root = str(default.GetPath()) if default else ""
+
+    def absolute(path: str) -> str:
+        return path if path.startswith("/") else f"{root}/{path}"
+
+    def below(path: str, tops: Sequence[str]) -> bool:
+        return any(path == top or path.startswith(top.rstrip("/") + "/") for top in map(absolute, tops))
+
+    return [path for path in paths if below(path, members.includes) and not below(path, members.excludes)]
+
+
+def _baked(operation: str, parameters: Mapping[str, Value], where: str) -> tuple[float, float, float] | None:
+    known = operations.find(operation)
+    return known.constant_delta(known.complete(parameters, where)) if known else None
+
+
+def _anchor(stage: Any) -> str:
+    default = stage.GetDefaultPrim()
+    return str(default.GetPath()) if default else "/"
+
+
+def _save(stage: Any, layer: str) -> None:
+    target = authoring.find_layer(stage, layer)
+    if not target.anonymous:
+        authoring.save_layer(target)

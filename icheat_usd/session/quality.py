@@ -1,0 +1,25 @@
+"""How much work goes into a preview."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Effort of the preview.
+
+    The defaults suit a 640 x 480 frame: 65,536 gather samples and 256 rays a row.
+    """
+
+    n_gather: int = 65_536
+    rays_per_row: int = 256
+    rays_per_bounce_row: int = 128
+    row_spacing: int = 1  #: pixels between the points where rows are kept; the rest is interpolated
+    light_samples: int = 16  #: shadow rays per light and point
+    n_bounces: int = 16  #: diffuse reflections before the last one
+    samples_per_pixel: int = 1
+    seed: int = 0
+
+
+DRAFT = Quality(n_gather=8_192, rays_per_row=64, rays_per_bounce_row=64, row_spacing=4, light_samples=8)
