@@ -105,7 +105,7 @@ def read_exr(path: str | os.PathLike[str]) -> Film:
             raise ImageError(f"{source}: not an OpenEXR file; convert it to .exr first")
         with OpenEXR.File(str(source), separate_channels=True) as file:
             parts = [(dict(part.header), {name: c.pixels for name, c in part.channels.items()}) for part in file.parts]
-    except (RuntimeError, ValueError, OSError) as problem:
+    except (RuntimeError, ValueError, OSError, MemoryError) as problem:
         raise ImageError(f"{source}: OpenEXR could not read the image ({problem}); write it again") from problem
     channels: dict[str, np.ndarray[Any, Any]] = {}
     metadata: dict[str, str] = {}

@@ -51,6 +51,10 @@ class Film:
         for key, text in self.metadata.items():
             if not isinstance(key, str) or not isinstance(text, str):
                 raise ImageError(f"film metadata '{key}' is {type(text).__name__}; convert it to text first")
+            if "\0" in key + text or not key:
+                raise ImageError(
+                    f"film metadata {key!r} is empty or contains a null character, which files cannot hold"
+                )
         # The film is frozen: what the caller does with its own dictionaries later stays outside.
         object.__setattr__(self, "layers", MappingProxyType(dict(self.layers)))
         object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))

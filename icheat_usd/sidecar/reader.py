@@ -125,8 +125,8 @@ def list_elements(file: Source, *, name: str | None = None) -> tuple[ElementInfo
             payload = _child_group(payloads, digest, where)
             for element in _link_names(payload, where):
                 group = _child_group(payload, element, f"{where}: {digest[:12]}")
-                type_, version = _element_mark(group, f"{where}: {digest[:12]}: element '{element}'")
-                for path, dataset in _datasets(group, f"{where}: {digest[:12]}: element '{element}'", [0]):
+                type_, version = _element_mark(group, f"{where}: {digest[:12]}: element '{_shown(element)}'")
+                for path, dataset in _datasets(group, f"{where}: {digest[:12]}: element '{_shown(element)}'", [0]):
                     raw = math.prod(dataset.shape) * dataset.dtype.itemsize
                     stored = int(dataset.id.get_storage_size())
                     kind = kind_of(dataset.dtype) or str(dataset.dtype)
@@ -173,7 +173,7 @@ def describe(file: Source, *, name: str | None = None) -> str:
     for entry in read_history(file, name=where):
         said = ", ".join(part for part in (entry.who, entry.when, entry.why) if part)
         lines.append(f"history  {said or '(not stated)'}: {len(entry.payloads)} payloads")
-    return "\n".join(lines)
+    return "\n".join([lines[0], *map(_shown, lines[1:])])
 
 
 # Inside the package ---------------------------------------------------------------------------------------------------
@@ -220,21 +220,21 @@ def read_elements(
             names = _payload_names(root, where)
             held = ", ".join(name[:12] for name in names[:5]) + (", ..." if len(names) > 5 else "")
             raise SidecarError(
-                f"{where}: there is no payload '{digest[:64]}'; the file holds {held or 'none'}: point icheat:filePath "
-                "to the file that was written with it"
+                f"{where}: there is no payload '{_shown(digest[:64])}'; the file holds {held or 'none'}: "
+                "point icheat:filePath to the file that was written with it"
             )
         payload = _child_group(payloads, digest, where)
         elements: dict[str, Element] = {}
         budget, count = [limit_bytes], [0]
         for name in _link_names(payload, where):
-            place = f"{where}: payload {digest[:12]}: element '{name}'"
+            place = f"{where}: payload {digest[:12]}: element '{_shown(name)}'"
             group = _child_group(payload, name, f"{where}: payload {digest[:12]}")
             type_, version = _element_mark(group, place)
             if refuse_newer:
                 # Before the values: those of a newer element may look like damage.
                 check_known(name, type_, version, f"{where}: payload {digest[:12]}")
             datasets = {
-                path: _read_dataset(dataset, f"{place}: '{path}'", budget)
+                path: _read_dataset(dataset, f"{place}: '{_shown(path)}'", budget)
                 for path, dataset in _datasets(group, place, count)
             }
             elements[name] = Element(type_, version, datasets)
@@ -264,7 +264,7 @@ def _payload_names(root: h5py.Group, where: str) -> list[str]:
         names = _link_names(_child_group(root, "payloads", where), where)
     for name in names:
         if not _DIGEST.fullmatch(name):
-            raise SidecarError(f"{where}: '/payloads/{name[:80]}' is not named by a digest; {_RESTORE}")
+            raise SidecarError(f"{where}: '/payloads/{_shown(name)}' is not named by a digest; {_RESTORE}")
     return names
 
 
@@ -272,7 +272,9 @@ def _link_names(group: h5py.Group, where: str) -> list[str]:
     names: list[str] = []
     for name in group:
         if not isinstance(name, str) or len(name) > _MAX_NAME or len(names) >= _MAX_OBJECTS:
-            raise SidecarError(f"{where}: group '{group.name}' has too many or impossible names; {_RESTORE}")
+            raise SidecarError(
+                f"{where}: group '{_shown(str(group.name))}' has too many or impossible names; {_RESTORE}"
+            )
         name.encode()
         names.append(name)
     return sorted(names, key=str.encode)
@@ -281,16 +283,18 @@ def _link_names(group: h5py.Group, where: str) -> list[str]:
 def _child(group: h5py.Group, name: str, where: str) -> Any:
     # Looked at before it is followed: opening an external link opens another file.
     if group.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
-        raise SidecarError(f"{where}: '{name}' is a soft or external link, which sidecars must not have; {_RESTORE}")
+        raise SidecarError(
+            f"{where}: '{_shown(name)}' is a soft or external link, which sidecars must not have; {_RESTORE}"
+        )
     return group[name]
 
 
 def _child_group(group: h5py.Group, name: str, where: str) -> h5py.Group:
     if not group.id.links.exists(name.encode()):
-        raise SidecarError(f"{where}: there is no group '{name}'; {_RESTORE}")
+        raise SidecarError(f"{where}: there is no group '{_shown(name)}'; {_RESTORE}")
     child = _child(group, name, where)
     if not isinstance(child, h5py.Group):
-        raise SidecarError(f"{where}: '{name}' is not a group; {_RESTORE}")
+        raise SidecarError(f"{where}: '{_shown(name)}' is not a group; {_RESTORE}")
     return child
 
 
@@ -306,7 +310,7 @@ def _datasets(group: h5py.Group, where: str, count: list[int], prefix: str = "")
         elif isinstance(child, h5py.Group):
             yield from _datasets(child, where, count, f"{prefix}{name}/")
         else:
-            raise SidecarError(f"{where}: '{prefix}{name}' is neither group nor dataset; {_RESTORE}")
+            raise SidecarError(f"{where}: '{_shown(prefix + name)}' is neither group nor dataset; {_RESTORE}")
 
 
 def _element_mark(group: h5py.Group, where: str) -> tuple[str, int]:
@@ -414,6 +418,11 @@ def _names(file: Source, name: str | None) -> str:
     if name is not None:
         return name
     return os.fspath(file) if isinstance(file, (str, os.PathLike)) else "sidecar in memory"
+
+
+def _shown(text: str) -> str:
+    """Text from a file as one line of a message or a terminal may show it: no control characters."""
+    return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text[:200])
 
 
 def _brief(problem: BaseException) -> str:

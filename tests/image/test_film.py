@@ -14,6 +14,8 @@ def test_layers_of_another_size_or_type_are_refused_by_name() -> None:
         Film(3, 2, {"beauty": np.zeros((3, 2, 3), np.float32)})
     with pytest.raises(ImageError, match="frame"):
         Film(3, 2, {}, {"frame": 12})  # type: ignore[dict-item]
+    with pytest.raises(ImageError, match="null character"):
+        Film(3, 2, {}, {"stage": "a\0b"})
     with pytest.raises(ImageError, match="no pixels"):
         Film(0, 2, {})
 

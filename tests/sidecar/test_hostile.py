@@ -255,6 +255,15 @@ def test_a_decompression_bomb_does_not_unfold(tampered: Tamper) -> None:
     tracemalloc.stop()
 
 
+def test_names_in_a_file_do_not_reach_the_terminal_raw(tampered: Tamper) -> None:
+    def name(file: h5py.File) -> None:
+        file.move(RECIPE, f"payloads/{SCALE}/\x1b[2Jrecipe\n")
+
+    path = tampered(name)
+    _refused(path, "is damaged")
+    assert "\\u001b[2Jrecipe\\u000a" in describe(path) and "\x1b" not in describe(path)
+
+
 def test_missing_chunks_are_damage_and_not_zeros(tampered: Tamper) -> None:
     def hole(file: h5py.File) -> None:
         _replace(file, f"{RECIPE}/parameters/amount", shape=(100,), dtype="f8", chunks=(10,))
