@@ -151,9 +151,14 @@ def transmittance(
         share = np.empty(len(ray), np.float32)
         tracing.straight_transmittance(points, directions, share)
         left[ray] *= share
-        limits = limits - hits.distance
+        # Going on from beside the ray must still end at the same place, which may be as close to a surface.
+        finite = np.isfinite(limits)
+        ends = origins + directions * np.where(finite, limits, 0)[:, None]
         origins = spawn_points(snapshot, points, directions)
-        alive = np.flatnonzero(share > 0)
+        onwards = np.where(finite[:, None], ends - origins, directions)
+        ahead = (onwards * directions).sum(1) > 0
+        directions, limits = onwards, np.where(finite, 1, np.inf).astype(np.float32)
+        alive = np.flatnonzero((share > 0) & ahead)
         ray, origins, directions, limits = ray[alive], origins[alive], directions[alive], limits[alive]
         if not len(ray):
             return np.repeat(left[:, None], 3, 1)
