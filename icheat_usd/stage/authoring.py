@@ -624,7 +624,8 @@ def set_payload_key(
 
     USD does not merge time samples of two layers. If another layer decides the
     keys, all of them are therefore copied to `layer` first, and the layer
-    notes where they came from; `check` reports when the source has moved on.
+    notes where they came from; `check` reports when the source has moved on. A
+    payload that held for all times is not a key, and the first key hides it.
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def test_layers_outside_the_stage_and_locked_ones_are_refused(stage: Usd.Stage, 
     stranger = Sdf.Layer.CreateNew(str(tmp_path / "stranger.usda"))
     for name in ("stranger.usda", stranger, "nothing.usda"):
         with pytest.raises(EditError, match="seq.usda"):
-            add(stage, "warm", name)  # type: ignore[arg-type]
+            add(stage, "warm", name)
     sequence = layer(stage, "seq.usda")
     sequence.SetPermissionToEdit(False)
     try:

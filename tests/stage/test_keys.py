@@ -11,7 +11,7 @@ from pxr import Sdf, Usd
 
 from icheat_usd.errors import EditError
 from icheat_usd.stage import schema
-from icheat_usd.stage.authoring import add_edit, create_stack
+from icheat_usd.stage.authoring import add_edit, create_stack, set_payload_key
 from icheat_usd.stage.keys import Key, KeyTrack, read_keys, strongest_opinion
 from tests.stage.edit_stages import DIGEST, OTHER, THIRD, layer, shot_stage
 
@@ -72,6 +72,23 @@ def test_each_key_finds_its_own_file_between_neighbours_that_are_close(tmp_path:
     assert track is not None
     assert [key.file for key in track.keys] == [f"./{i}.h5" for i in range(6)]
     assert [key.resolved for key in track.keys] == [str(tmp_path / f"{i}.h5") for i in range(6)]
+
+
+def test_frame_rates_that_differ_between_layers_scale_key_times(tmp_path: Path) -> None:
+    stage = shot_stage(tmp_path, offset=10)
+    prim = keyed_edit(stage, {25: DIGEST, 50: OTHER})
+    layer(stage, "seq.usda").timeCodesPerSecond = 25
+    stage.GetRootLayer().timeCodesPerSecond = 24
+    track = read_keys(prim)
+    assert track is not None
+    assert track.times == pytest.approx((34.0, 58.0), abs=1e-12)
+    assert [prim.GetAttribute(schema.PAYLOAD).Get(t) for t in (57.99, 58.01)] == [DIGEST, OTHER]
+    set_payload_key(
+        stage, "/World/indirect/warm", layer="seq.usda", time=58, payload=(tmp_path / "edits.v001.icheat.h5", THIRD)
+    )
+    track = read_keys(prim)
+    assert track is not None
+    assert [key.digest for key in track.keys] == [DIGEST, THIRD]
 
 
 def test_keys_interpolate_linearly_inside_and_hold_outside(tmp_path: Path) -> None:
