@@ -1,0 +1,37 @@
+"""What the verbs that write to a layer have in common."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from icheat_usd.errors import EditError
+
+
+def open_for_writing(options: argparse.Namespace) -> tuple[Any, str]:
+    """The stage, and the layer to write to: --layer, else the stage's root layer."""
+    from icheat_usd.session import inspection
+
+    stage = inspection.open_stage(options.stage)
+    return stage, options.layer or stage.GetRootLayer().identifier
+
+
+def named_edit(stage: Any, options: argparse.Namespace) -> tuple[str, str]:
+    """Paths of the stack and of the edit that the command line names, the latter by path or by name.
+
+    Raises
+    ------
+    EditError
+        The stage has no such stack, or the stack no such edit.
+    """
+    from icheat_usd.session import inspection
+
+    path = inspection.find_stack(stage, options.stack, options.camera)
+    if path is None:
+        raise EditError(f"{options.stage} has no edit stack; make one with `icheat stack create`")
+    stack = inspection.describe_stack(stage, path)
+    paths = [edit.path for edit in stack.edits]
+    found = [p for p in paths if p == options.edit] or [p for p in paths if p.rpartition("/")[2] == options.edit]
+    if len(found) != 1:
+        raise EditError(f"{path} has no edit '{options.edit}'; it has {', '.join(paths) or 'no edits'}")
+    return path, found[0]

@@ -1,0 +1,110 @@
+"""What `relight` and `render` have in common: frames in, files out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from icheat_usd.cli.frames import frame_path, has_frame
+from icheat_usd.cli.options import finding_as_json, finding_as_text, print_json
+from icheat_usd.cli.progress import ProgressLine
+from icheat_usd.errors import ImageError
+
+if TYPE_CHECKING:
+    from icheat_usd.image.film import Film
+    from icheat_usd.session import Quality, Session
+
+_SUFFIXES = (".exr", ".png")
+
+
+def make_images(options: argparse.Namespace, quality: Quality, make: Callable[[Session], Film]) -> int:
+    """Open the stage at each frame, make its film and write every --out of it.
+
+    Raises
+    ------
+    ImageError
+        An output cannot be named or its folder does not exist; found before anything is computed.
+    """
+    frames: tuple[float | None, ...] = options.frames or (options.frame,)
+    files = {frame: _outputs(options.out, frame, len(frames)) for frame in frames}
+
+    from icheat_usd.session import Session
+    from icheat_usd.stage import open_stage
+
+    images: list[dict[str, Any]] = []
+    found: dict[Any, None] = {}
+    stage = open_stage(options.stage)
+    with ProgressLine() as progress:
+        for frame in frames:
+            began = time.perf_counter()
+            progress.prefix = f"frame {frame:g}: " if frame is not None and len(frames) > 1 else ""
+            session = Session.open(
+                stage,
+                camera=options.camera,
+                frame=frame,
+                stack=options.stack,
+                width=options.width,
+                height=options.height,
+                quality=quality,
+                progress=progress,
+            )
+            film = make(session)
+            for path in files[frame]:
+                write_film(film, path, layer=options.show, view=options.view, exposure=options.exposure)
+            found |= dict.fromkeys(session.findings)
+            seconds = time.perf_counter() - began
+            images.append(
+                {
+                    "frame": frame,
+                    "files": [str(path) for path in files[frame]],
+                    "width": film.width,
+                    "height": film.height,
+                    "seconds": round(seconds, 3),
+                    "metadata": dict(film.metadata),
+                }
+            )
+            if not options.json:
+                for path in files[frame]:
+                    print(path, flush=True)
+    if options.json:
+        print_json(
+            {"stage": options.stage, "images": images, "findings": [finding_as_json(finding) for finding in found]}
+        )
+    else:
+        for finding in found:
+            print(finding_as_text(finding), file=sys.stderr)
+    return 1 if found and options.strict else 0
+
+
+def write_film(
+    film: Film, path: Path, *, layer: str = "beauty", view: str | None = None, exposure: float = 0.0
+) -> None:
+    """Write a film as its suffix says."""
+    from icheat_usd.image.exr import write_exr
+    from icheat_usd.image.png import write_png
+
+    if path.suffix.lower() == ".exr":
+        write_exr(film, path)
+    else:
+        write_png(film, path, layer=layer, view=view, exposure=exposure)
+
+
+def _outputs(patterns: list[str], frame: float | None, n_frames: int) -> list[Path]:
+    paths = []
+    for pattern in patterns:
+        if Path(pattern).suffix.lower() not in _SUFFIXES:
+            raise ImageError(f"--out {pattern}: the name must end in .exr or .png")
+        if n_frames > 1 and not has_frame(pattern):
+            raise ImageError(f"--out {pattern}: {n_frames} frames would share one file; write #### for the frame")
+        try:
+            path = frame_path(pattern, frame)
+        except ValueError as error:
+            raise ImageError(f"--out: {error}") from error
+        if not path.parent.is_dir():
+            raise ImageError(f"--out {path}: there is no folder '{path.parent}'; make it first or choose another path")
+        paths.append(path)
+    return paths

@@ -1,0 +1,86 @@
+"""Edit, preview and render indirect light in USD stages."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import traceback
+from importlib import import_module
+
+from icheat_usd import __version__
+from icheat_usd.errors import IcheatError
+
+#: Modules of `icheat_usd.cli`, in the order of the help; each has a docstring (its help), `setup_parser` and `command`.
+VERBS = ("demo", "relight", "render", "stack", "edit", "tree", "cat", "check", "plugin_path")
+
+CLEAN, FINDINGS, FAILURE, INTERRUPTED = 0, 1, 2, 130
+
+_EPILOG = "Exit status: 0 clean, 1 findings, 2 failure, 130 interrupted. `icheat VERB --help` tells more."
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line; verbs import their libraries only when they run."""
+    parser = argparse.ArgumentParser(prog="icheat", description=__doc__, epilog=_EPILOG)
+    parser.add_argument("--version", action="version", version=f"icheat {__version__}")
+    parser.add_argument("--traceback", action="store_true", help="show where in the program an error arose")
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+    for name in VERBS:
+        module = import_module(f"icheat_usd.cli.{name}")
+        add_verb(verbs, name.replace("_", "-"), module)
+    return parser
+
+
+def add_verb(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, module: object) -> None:
+    doc = str(module.__doc__).strip()
+    verb = verbs.add_parser(
+        name,
+        help=doc.splitlines()[0].rstrip("."),
+        description=doc,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.setup_parser(verb)  # type: ignore[attr-defined]
+    if hasattr(module, "command"):
+        verb.set_defaults(command=module.command)
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run one command line; every failure becomes one line on stderr and an exit status."""
+    try:
+        options = build_parser().parse_args(arguments)
+    except SystemExit as end:  # argparse: 0 after --help, 2 after a usage error
+        return int(end.code or 0)
+    try:
+        status = int(options.command(options))
+        sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        print("\nicheat: interrupted; nothing was left half-written", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader left (`icheat tree … | head`). Keep the interpreter's last flush from complaining about it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CLEAN
+    except IcheatError as error:
+        return _fail(options, str(error))
+    except OSError as error:
+        return _fail(options, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except MemoryError:
+        return _fail(options, "out of memory; lower --width and --height or the quality")
+    except Exception as error:
+        # A mistake in this program. Python would exit with 1, which here means "findings".
+        traceback.print_exc()
+        return _fail(
+            options, f"internal error ({type(error).__name__}: {error}); please report it with the lines above"
+        )
+
+
+def _fail(options: argparse.Namespace, message: str) -> int:
+    if options.traceback:
+        traceback.print_exc()
+    line = " ".join(message.split())
+    print(f"icheat: error: {line}", file=sys.stderr)
+    if getattr(options, "json", False):
+        print(json.dumps({"version": 1, "error": line}))
+    return FAILURE

@@ -1,0 +1,106 @@
+"""Options that several verbs share."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from icheat_usd.cli.frames import parse_frames
+
+#: Version of everything that --json prints; raised when a key changes its meaning or goes.
+JSON_VERSION = 1
+
+
+def add_stage(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("stage", metavar="STAGE", help="USD file to open")
+
+
+def add_stack(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--stack", metavar="PRIM", help="edit stack; else the render settings', else the camera's only one"
+    )
+
+
+def add_layer(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--layer", metavar="LAYER", help="layer of the stage to write to: path or file name; default STAGE itself"
+    )
+
+
+def add_frame(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--frame", type=float, metavar="T", help="time code; default the stage's first")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object for programs")
+
+
+def add_image(parser: argparse.ArgumentParser) -> None:
+    """Options of the verbs that make images."""
+    add_stage(parser)
+    parser.add_argument(
+        "-o",
+        "--out",
+        action="append",
+        required=True,
+        metavar="FILE",
+        help=".exr (all layers) or .png (as displayed); may be given several times; #### stands for the frame",
+    )
+    parser.add_argument(
+        "--camera", metavar="PRIM", help="camera; else the render settings', else the only one; 'auto' frames the scene"
+    )
+    times = parser.add_mutually_exclusive_group()
+    add_frame(times)  # type: ignore[arg-type]
+    times.add_argument("--frames", type=parse_frames, metavar="SPEC", help="several frames: 1:10x2 or 1,5,9")
+    add_stack(parser)
+    parser.add_argument("--width", type=positive, metavar="PIXELS", help="else the render settings' resolution")
+    parser.add_argument("--height", type=positive, metavar="PIXELS")
+    parser.add_argument("--view", metavar="NAME", help="OCIO view of .png files; default the display's own")
+    parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="for .png files; default 0")
+    parser.add_argument("--show", default="beauty", metavar="LAYER", help="film layer in .png files; default beauty")
+    parser.add_argument("--seed", type=int, default=0, help="of all random numbers; default 0")
+    parser.add_argument("--strict", action="store_true", help="exit with 1 if the stage has findings")
+    add_json(parser)
+
+
+def positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not at least 1")
+    return value
+
+
+def read_value(text: str) -> float | bool | str | tuple[float, ...]:
+    """A parameter value as typed: `true`, `1.5`, `1.2,0.9,0.7`, else a word."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return text
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def assignment(text: str) -> tuple[str, float | bool | str | tuple[float, ...]]:
+    """`name=value` of --set."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip() or not value.strip():
+        raise argparse.ArgumentTypeError(f"'{text}' is no NAME=VALUE, such as gain=0.5 or color=1.2,1,0.8")
+    return name.strip(), read_value(value.strip())
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    print(json.dumps({"version": JSON_VERSION, **content}, indent=2))
+
+
+def finding_as_json(finding: Any) -> dict[str, Any]:
+    return {key: str(value) for key, value in asdict(finding).items()}
+
+
+def finding_as_text(finding: Any) -> str:
+    severity = getattr(finding, "severity", "warning")
+    place = " ".join(part for part in (finding.prim, finding.feature) if part)
+    return f"{severity}: {place}: {finding.message}"

@@ -1,0 +1,64 @@
+"""What a stage's edits are and what is wrong with them, without rendering anything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from icheat_usd.scene import Finding
+from icheat_usd.session.authoring import read_payload
+from icheat_usd.stage import open_stage, schema
+from icheat_usd.stage.check import check_stage
+from icheat_usd.stage.edit_stack import EditDescription, describe_edit, find_stack, stack_prim, stack_prims
+from icheat_usd.stage.opening import composition_findings
+
+
+@dataclass(frozen=True)
+class StackDescription:
+    """A stack as composed: its edits in the order in which they apply, inactive ones included."""
+
+    path: str
+    enabled: bool
+    cameras: tuple[str, ...]
+    edits: tuple[EditDescription, ...]
+    missing: tuple[str, ...]  #: targets that do not exist or are no edits
+
+
+def describe_stacks(stage: Any, frame: float | None = None) -> tuple[StackDescription, ...]:
+    """Every stack on the stage, in order of traversal."""
+    return tuple(describe_stack(stage, str(prim.GetPath()), frame) for prim in stack_prims(stage))
+
+
+def describe_stack(stage: Any, path: str, frame: float | None = None) -> StackDescription:
+    """One stack at a time.
+
+    Raises
+    ------
+    EditError
+        There is no stack at `path`.
+    """
+    prim = stack_prim(stage, path)
+    edits, missing = [], []
+    relationship = prim.GetRelationship(schema.EDITS)
+    for target in relationship.GetTargets() if relationship else ():
+        edit = stage.GetPrimAtPath(target)
+        if not edit or (edit.IsActive() and not schema.has_schema(edit, schema.EDIT_API)):
+            missing.append(str(target))
+        else:
+            edits.append(describe_edit(stage, str(target), frame))
+    cameras = prim.GetRelationship(schema.CAMERA)
+    return StackDescription(
+        path=str(prim.GetPath()),
+        enabled=bool(schema.read_attribute(prim, schema.STACK_ENABLED, frame)),
+        cameras=tuple(str(camera) for camera in cameras.GetTargets()) if cameras else (),
+        edits=tuple(edits),
+        missing=tuple(missing),
+    )
+
+
+def check(stage: Any, frame: float | None = None) -> tuple[Finding, ...]:
+    """Everything wrong with a stage's composition and its edits; every payload is read."""
+    return (*composition_findings(stage), *check_stage(stage, frame, read_payload))
+
+
+__all__ = ["StackDescription", "check", "describe_stack", "describe_stacks", "find_stack", "open_stage"]
