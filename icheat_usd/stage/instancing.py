@@ -21,7 +21,7 @@ class _Part:
     """One mesh of a prototype."""
 
     mesh: int
-    matrix: F64  #: (4, 4) row-vector, to the prototype's root
+    matrix: F64  #: (4, 4) row-vector, through the transform of the prototype's root
     name: str  #: path relative to the prototype
 
 
@@ -103,11 +103,17 @@ class InstancerReader:
             count = 0 if positions is None else len(positions)
             self._report(prim, "point instancer", f"it has {n} protoIndices and {count} positions; left out.")
             return None
+        for name in ("orientations", "orientationsf", "scales", "velocities", "accelerations", "angularVelocities"):
+            attribute = prim.GetAttribute(name)
+            values = attribute.Get(time) if attribute else None
+            if values and len(values) != n:
+                self._report(prim, name, f"{name} has {len(values)} values for {n} instances; ignored.")
+        # With prototype transforms included USD gives up altogether where one index is wrong.
         matrices = instancer.ComputeInstanceTransformsAtTime(
-            time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+            time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
         )
         if matrices is None or len(matrices) != n:
-            self._report(prim, "point instancer", "USD finds no transforms: check orientations and scales; left out.")
+            self._report(prim, "point instancer", "USD finds no transforms for its instances; left out.")
             return None
         return np.array(matrices, dtype=np.float64)
 
@@ -138,13 +144,15 @@ class InstancerReader:
         if path in self._parts:
             return self._parts[path]
         builder = self._builder
+        own, _ = builder.xforms.GetLocalTransformation(root)
+        to_prototype = np.array(own)  # the instance's transform comes on top of the prototype's own
         found = walk(root, self._report, prototypes=True)
         for light in found.lights:
             if light not in found.gprims:
                 self._report(light, "instanced light", "a light inside a point-instanced prototype is left out.")
         gprims = [prim for prim in found.gprims if self._is_shown_within(prim, root)]
         parts = [
-            _Part(mesh, relative_matrix(builder.xforms, prim, root), _relative_path(prim, root))
+            _Part(mesh, relative_matrix(builder.xforms, prim, root) @ to_prototype, _relative_path(prim, root))
             for prim, mesh in zip(gprims, builder.add_meshes(gprims), strict=True)
             if mesh is not None
         ]
@@ -154,7 +162,7 @@ class InstancerReader:
             if depth + 1 >= DEEPEST:
                 self._report(nested, "nested point instancer", f"nested deeper than {DEEPEST}; left out.")
                 continue
-            base, matrix = _relative_path(nested, root), relative_matrix(builder.xforms, nested, root)
+            base, matrix = _relative_path(nested, root), relative_matrix(builder.xforms, nested, root) @ to_prototype
             for placed in self._expand(nested, depth + 1):
                 below = f"/{placed.part}" if placed.part else ""
                 parts.extend(
