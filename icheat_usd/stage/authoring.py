@@ -20,6 +20,7 @@ from typing import Any
 
 from pxr import Ar, Sdf, Tf, Usd
 
+from icheat_usd.edits import operations
 from icheat_usd.edits.model import Blend, Value
 from icheat_usd.errors import EditError, StageError
 from icheat_usd.stage import collections, schema
@@ -548,12 +549,17 @@ def _set_operation(
     if found is None:
         return written
     _apply(prim, found.api_schema)
+    implementation = operations.find(operation)
     for name, value in parameters.items():
         parameter = found.parameters.get(name)
         if parameter is None:
             listed = ", ".join(sorted(found.parameters))
             raise EditError(f"{prim.GetPath()}: operation '{operation}' has no parameter '{name}'; it has {listed}")
-        _set(prim, parameter.name, _checked_value(prim, parameter, value), time)
+        checked = _checked_value(prim, parameter, value)
+        given = schema.to_value(checked)
+        if implementation is not None and given is not None:  # It may know bounds that no schema can state.
+            implementation.complete({name: given}, str(prim.GetPath()))
+        _set(prim, parameter.name, checked, time)
         written.append(parameter.name)
     return written
 

@@ -84,33 +84,33 @@ def find_stack(stage: Usd.Stage, stack: str | None = None, camera: str | None = 
     EditError
         The named stack does not exist, or several could be meant.
     """
-    prims = stack_prims(stage)
-    paths = [str(prim.GetPath()) for prim in prims]
     if stack is not None:
-        return _named_stack(stage, stack, paths)
+        return _named_stack(stage, stack)
     settings = stage.GetMetadata("renderSettingsPrimPath")
-    if settings and settings in paths:
+    if settings and schema.has_schema(stage.GetPrimAtPath(settings), schema.STACK_API):
         return str(settings)
-    if not prims:
+    targets = {str(prim.GetPath()): _targets(prim, schema.CAMERA) for prim in stack_prims(stage)}
+    if not targets:
         return None
-    targets = {str(prim.GetPath()): _targets(prim, schema.CAMERA) for prim in prims}
-    candidates = [path for path in paths if camera is not None and camera in targets[path]]
-    candidates = candidates or [path for path in paths if camera is None or not targets[path]]
+    candidates = [path for path, cameras in targets.items() if camera is not None and camera in cameras]
+    candidates = candidates or [path for path, cameras in targets.items() if camera is None or not cameras]
     if len(candidates) == 1:
         return candidates[0]
     whose = f" for camera {camera}" if camera is not None else ""
     raise EditError(
-        f"{stage.GetRootLayer().identifier}: {len(candidates) or 'none'} of the stacks {', '.join(paths)} can be "
+        f"{stage.GetRootLayer().identifier}: {len(candidates) or 'none'} of the stacks {', '.join(targets)} can be "
         f"meant{whose}; name one with --stack"
     )
 
 
-def _named_stack(stage: Usd.Stage, stack: str, paths: list[str]) -> str:
-    default = stage.GetDefaultPrim()
-    root = default.GetPath() if default else Sdf.Path.absoluteRootPath
-    path = str(Sdf.Path(stack).MakeAbsolutePath(root)) if Sdf.Path.IsValidPathString(stack) else ""
-    by_name = [p for p in paths if p.rpartition("/")[2] == stack]
-    found = [path] if path in paths else by_name
+def _named_stack(stage: Usd.Stage, stack: str) -> str:
+    if Sdf.Path.IsValidPathString(stack):
+        default = stage.GetDefaultPrim()
+        path = Sdf.Path(stack).MakeAbsolutePath(default.GetPath() if default else Sdf.Path.absoluteRootPath)
+        if schema.has_schema(stage.GetPrimAtPath(path), schema.STACK_API):
+            return str(path)
+    paths = [str(prim.GetPath()) for prim in stack_prims(stage)]
+    found = [path for path in paths if path.rpartition("/")[2] == stack]
     if len(found) != 1:
         known = f"it has {', '.join(paths)}" if paths else "make one with `icheat stack create`"
         raise EditError(f"{stage.GetRootLayer().identifier}: no stack '{stack}'; {known}")
@@ -320,7 +320,7 @@ def read_parameters(prim: Usd.Prim, operation: str, time: float | None) -> Mappi
 
 
 def authored_parameters(prim: Usd.Prim, operation: str, time: float | None) -> dict[str, Value]:
-    """What the stage itself says about an operation's parameters, of known and unknown operations.
+    """What the stage itself says about the parameters of an operation, known or not.
 
     Raises
     ------
@@ -328,10 +328,13 @@ def authored_parameters(prim: Usd.Prim, operation: str, time: float | None) -> d
         A value is not finite.
     """
     prefix = f"icheat:{operation}"
+    known = schema.operations().get(operation)
     found: dict[str, Value] = {}
     for attribute in prim.GetAuthoredPropertiesInNamespace(prefix):
         if not isinstance(attribute, Usd.Attribute) or not attribute.HasAuthoredValue():
             continue
+        if known is not None and attribute.GetName()[len(prefix) + 1 :] not in known.parameters:
+            continue  # Mistyped: means nothing, as anywhere in USD; `check` reports it.
         value = attribute.Get(schema.time_code(time))
         converted = None if value is None else schema.to_value(value)
         if converted is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
+from icheat_usd.edits import operations
 from icheat_usd.errors import EditError, SidecarError
 from icheat_usd.stage import schema
 from icheat_usd.stage.authoring import (
@@ -243,6 +244,27 @@ def test_numbers_that_are_not_finite_are_errors(stage: Usd.Stage, name: str) -> 
         read_edit_stack(stage, STACK, None, SURFACES)
 
 
+def test_a_mistyped_parameter_means_nothing(stage: Usd.Stage) -> None:
+    prim = stage.GetPrimAtPath(add(stage, "warm"))
+    prim.CreateAttribute("icheat:scale:gian", Sdf.ValueTypeNames.Float).Set(3.0)
+    (edit,) = read_edit_stack(stage, STACK, None, SURFACES)[0].edits
+    assert dict(edit.parameters) == {"gain": 1.0, "color": (1.0, 1.0, 1.0)}
+
+
+def test_schemas_and_implementations_declare_the_same_operations() -> None:
+    declared = {
+        name: {parameter: schema.to_value(p.fallback) for parameter, p in operation.parameters.items()}
+        for name, operation in schema.operations().items()
+    }
+    assert declared == {name: implementation(name) for name in operations.names()}
+
+
+def implementation(name: str) -> dict[str, object]:
+    found = operations.find(name)
+    assert found is not None
+    return {parameter.name: parameter.default for parameter in found.parameters}
+
+
 # --------------------------------------------------------------------------- digest
 
 
@@ -306,7 +328,6 @@ def test_render_settings_decide_before_the_camera_does(stage: Usd.Stage) -> None
     create_stack(stage, "for_camera", layer="shot.usda", camera="camera")
     stage.DefinePrim("/World/settings", "RenderSettings")
     create_stack(stage, "settings", layer="shot.usda")
-    stage.GetRootLayer().GetPrimAtPath("/World")
     stage.SetMetadata("renderSettingsPrimPath", "/World/settings")
     assert find_stack(stage, camera="/World/camera") == "/World/settings"
 
