@@ -30,7 +30,7 @@ from icheat_usd.stage.keys import SAME_TIME, Key, KeyTrack, read_keys, strongest
 #: customData of icheat:payload in a layer that copied another layer's keys: where they came from.
 COPIED_FROM = "icheatCopiedFrom"
 
-#: Layers larger than this are neither compared with their file nor restored after a refused edit.
+#: Layers whose file is larger than this are not compared with it before the first edit.
 _MAX_COMPARED_BYTES = 8 << 20
 _seen_on_disk: dict[str, str] = {}
 
@@ -149,23 +149,31 @@ def _first_line(error: Tf.ErrorException) -> str:
 
 
 @contextmanager
-def _writing(stage: Usd.Stage, layer: str | Sdf.Layer) -> Iterator[Sdf.Layer]:
-    """Write to a layer, times mapped into it; USD's refusals become errors, and the layer is as before then."""
+def _writing(stage: Usd.Stage, layer: str | Sdf.Layer, path: Sdf.Path) -> Iterator[Sdf.Layer]:
+    """Write opinions at or below `path` to a layer, times mapped into it.
+
+    USD's refusals become errors; after any error the layer says what it said before.
+    """
     schema.require_registered()
     target = find_layer(stage, layer)
     before = Sdf.Layer.CreateAnonymous()
-    small = not target.realPath or os.path.getsize(target.realPath) <= _MAX_COMPARED_BYTES
-    if small:
-        before.TransferContent(target)
+    existed = bool(target.GetPrimAtPath(path))
+    if existed:
+        Sdf.CreatePrimInLayer(before, path)
+        Sdf.CopySpec(target, path, before, path)
+    first_new = next((prefix for prefix in path.GetPrefixes() if not target.GetPrimAtPath(prefix)), path)
     try:
         with Usd.EditContext(stage, stage.GetEditTargetForLocalLayer(target)):
             yield target
-    except (Tf.ErrorException, EditError) as error:
-        if small:
-            target.TransferContent(before)
-        if isinstance(error, EditError):
-            raise
-        raise EditError(f"{target.identifier}: USD refused the edit ({_first_line(error)})") from error
+    except BaseException as error:
+        if existed:
+            Sdf.CopySpec(before, path, target, path)
+        elif target.GetPrimAtPath(first_new):
+            siblings = target.GetPrimAtPath(first_new.GetParentPath()).nameChildren
+            del siblings[first_new.name]
+        if isinstance(error, Tf.ErrorException):
+            raise EditError(f"{target.identifier}: USD refused the edit ({_first_line(error)})") from error
+        raise
 
 
 # --------------------------------------------------------------------------- stacks
@@ -213,7 +221,7 @@ def create_stack(stage: Usd.Stage, path: str, *, layer: str | Sdf.Layer, camera:
     if schema.has_schema(existing, schema.STACK_API):
         raise EditError(f"{stack_path} is a stack already; add edits to it or choose another path")
     cameras = collections.find_prims(stage, [camera], "camera") if camera is not None else ()
-    with _writing(stage, layer):
+    with _writing(stage, layer, stack_path):
         for ancestor in stack_path.GetPrefixes()[:-1]:
             if not stage.GetPrimAtPath(ancestor) or not stage.GetPrimAtPath(ancestor).IsDefined():
                 stage.DefinePrim(ancestor, "Scope")
@@ -277,7 +285,7 @@ def add_edit(
     if stage.GetPrimAtPath(path):
         raise EditError(f"{path} exists already; choose another name or set its values")
     _refuse_instances(stage, path)
-    with _writing(stage, layer) as target:
+    with _writing(stage, layer, prim.GetPath()) as target:
         edit = stage.DefinePrim(path, "Scope")
         _apply(edit, schema.EDIT_API)
         _set_operation(edit, operation, parameters or {}, time, has_payload=payload is not None)
@@ -327,7 +335,7 @@ def move_edit(
         An edit is not in the stack, or a stronger layer decides the order.
     """
     prim = stack_prim(stage, stack)
-    with _writing(stage, layer) as target:
+    with _writing(stage, layer, prim.GetPath()) as target:
         _move(prim, _listed(prim, edit), target, before=before, after=after)
 
 
@@ -343,7 +351,7 @@ def remove_edit(stage: Usd.Stage, stack: str, edit: str, *, layer: str | Sdf.Lay
     """
     prim = stack_prim(stage, stack)
     path = _listed(prim, edit)
-    with _writing(stage, layer) as target:
+    with _writing(stage, layer, prim.GetPath()) as target:
         relationship = _relationship(prim, schema.EDITS)
         relationship.RemoveTarget(path)
         if path in relationship.GetTargets():
@@ -439,7 +447,7 @@ def set_edit(
     prim = _writable_edit(stage, edit)
     written: list[str] = []
     selections: list[EditFinding] = []
-    with _writing(stage, layer) as target:
+    with _writing(stage, layer, prim.GetPath()) as target:
         if operation is not None or parameters:
             token = operation or str(schema.read_attribute(prim, schema.OPERATION, time))
             has_payload = strongest_opinion(prim.GetAttribute(schema.PAYLOAD)) is not None
@@ -650,7 +658,7 @@ def set_payload_key(
     if interpolation not in (None, "linear", "held"):
         raise EditError(f"{edit}: no key interpolation is called '{interpolation}'; there are linear, held")
     prim = _writable_edit(stage, edit)
-    with _writing(stage, layer) as target:
+    with _writing(stage, layer, prim.GetPath()) as target:
         if time is None:
             _clear_keys(prim, target)
         else:

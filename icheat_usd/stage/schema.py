@@ -110,7 +110,11 @@ def require_registered() -> None:
 
 def has_schema(prim: Usd.Prim, name: str) -> bool:
     """Whether the schema is applied to `prim`, registered or not."""
-    return bool(prim) and (name in prim.GetPrimTypeInfo().GetAppliedAPISchemas() or name in prim.GetAppliedSchemas())
+    if not prim:
+        return False
+    authored = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+    # The second list also has what other schemas bring along; most prims have neither, and it is slower to get.
+    return name in authored or (bool(authored) and name in prim.GetAppliedSchemas())
 
 
 def fallback(property_name: str) -> Any:
