@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from icheat_usd.scene import F32, Hits, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, U8, Hits, SceneSnapshot, SurfacePoints
+
+_PLACE = SurfacePoints._fields.index("albedo")
 
 
 def empty_points(n: int) -> SurfacePoints:
@@ -68,10 +70,11 @@ def shade_hits(snapshot: SceneSnapshot, hits: Hits, directions: F32) -> SurfaceP
     """
     from icheat_usd.kernels import surface
 
-    out = empty_points(len(hits.instance))
+    side = np.empty(len(hits.instance), np.uint8)
     rows = np.require(directions, np.float32, ["C", "W"])
-    surface.shade_hits(snapshot.geometry, snapshot.materials, snapshot.textures, hits, rows, out)
-    return out
+    geometry = snapshot.geometry
+    surface.sides_seen(geometry.points, geometry.instance_to_object, hits.instance, hits.triangle, rows, side)
+    return _points(snapshot, hits.instance, hits.triangle, hits.u, hits.v, side)
 
 
 def points_on_surface(
@@ -95,18 +98,32 @@ def points_on_surface(
     SurfacePoints
         As of `shade_hits`.
     """
-    from icheat_usd.kernels import surface
-
     owners = np.require(instance, np.int32, ["C", "W"])
-    out = empty_points(len(owners))
-    surface.points_on_surface(
-        snapshot.geometry,
-        snapshot.materials,
-        snapshot.textures,
+    weights = np.asarray(barycentric, np.float32).reshape(-1, 2)
+    return _points(
+        snapshot,
         owners,
         np.require(triangle, np.int32, ["C", "W"]),
-        np.require(barycentric, np.float32, ["C", "W"]).reshape(-1, 2),
+        np.ascontiguousarray(weights[:, 0]),
+        np.ascontiguousarray(weights[:, 1]),
         np.require(np.broadcast_to(np.asarray(side, np.uint8), owners.shape), np.uint8, ["C", "W"]),
-        out,
     )
+
+
+def _points(snapshot: SceneSnapshot, instance: I32, triangle: I32, u: F32, v: F32, side: U8) -> SurfacePoints:
+    from icheat_usd.kernels import surface
+
+    n = len(instance)
+    out = empty_points(n)
+    st, color = np.empty((n, 2), np.float32), np.empty((n, 3), np.float32)
+    # Columns of `SurfacePoints` stand in this order: the place first, then what is seen there.
+    place: list[Any] = list(out[:_PLACE])
+    seen: list[Any] = list(out[_PLACE:])
+    surface.place_points(snapshot.geometry, instance, triangle, u, v, side, st, color, *place)
+    materials, material = snapshot.materials, snapshot.geometry.material
+    inputs = np.empty((n, 6, 3), np.float32)
+    surface.constant_inputs(materials, material, out.instance, out.triangle, color, inputs)
+    if (materials.texture >= 0).any():
+        surface.sample_inputs(materials, snapshot.textures, material, out.instance, out.triangle, st, inputs)
+    surface.reflectances(materials, material, out.instance, out.triangle, inputs, *seen)
     return out
