@@ -16,6 +16,7 @@ from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar import Element, pack, payload_digest, read_payload, write_payloads
 from icheat_usd.sidecar import elements as registry
+from icheat_usd.sidecar.canonical import digest_of
 
 _text = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=12)
 _name = _text.filter(bool)
@@ -159,6 +160,20 @@ def test_what_cannot_be_stored_is_refused_by_name_and_leaves_no_file(
     with pytest.raises(SidecarError, match=message):
         write_payloads(tmp_path / "shot.usda", [payload], anchor="/World")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_minus_zero_is_zero_in_names_and_in_files() -> None:
+    payloads = [
+        Payload("scale", {"amount": zero}, _mask([[[zero]], [[0.001]]]), None, (zero, 1.0, 2.0)) for zero in (0.0, -0.0)
+    ]
+    plus, minus = (registry.encode_payload(payload, anchor="/World") for payload in payloads)
+    for element in minus.values():
+        for path, values in element.datasets.items():
+            assert values.dtype.kind != "f" or not np.signbit(values).any(), path
+    assert digest_of(plus) == digest_of(minus)
+    # Also in an element that another writer made and we only copy.
+    foreign = [digest_of({"later": Element("later", 1, {"a": np.array([zero, 1.0])})}) for zero in (0.0, -0.0)]
+    assert foreign[0] == foreign[1]
 
 
 def test_an_anchor_that_is_no_prim_path_is_refused(tmp_path: Path) -> None:

@@ -80,6 +80,28 @@ def test_processes_that_write_at_once_get_different_names(tmp_path: Path) -> Non
         read_payload(name, digest, anchor="/W")
 
 
+@pytest.mark.parametrize("links", [True, False])
+def test_a_writer_that_was_overtaken_takes_the_next_name(
+    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = [tmp_path / f"shot.v{i:03d}.icheat.h5" for i in (1, 2)]
+    for path in taken:
+        path.write_text("of the faster writer")
+
+    def listed_before(folder: Path) -> list[str]:
+        return []
+
+    def refused(*_: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "listdir", listed_before)
+    if not links:
+        monkeypatch.setattr(os, "link", refused)
+    file, (digest,) = write_payloads(tmp_path / "shot.usda", [_payload(1.0)], anchor="/World")
+    assert file.name == "shot.v003.icheat.h5" and list_payloads(file) == (digest,)
+    assert {path.read_text() for path in taken} == {"of the faster writer"}
+
+
 @pytest.mark.parametrize("where", ["fill", "flush", "name"])
 def test_an_interrupted_write_leaves_nothing(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
