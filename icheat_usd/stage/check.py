@@ -30,6 +30,7 @@ from icheat_usd.stage.edit_stack import (
     open_asset,
 )
 from icheat_usd.stage.keys import SAME_TIME, read_keys, strongest_opinion
+from icheat_usd.stage.opening import quiet_usd
 
 
 @dataclass(frozen=True)
@@ -70,16 +71,17 @@ def check_stage(
     read_payload
         Given one, every payload is read.
     """
-    everything = list(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
-    stacks = tuple(prim for prim in everything if schema.has_schema(prim, schema.STACK_API))
-    edits = tuple(prim for prim in everything if schema.has_schema(prim, schema.EDIT_API))
-    listed = frozenset(str(prim.GetPath()) for stack in stacks for prim in listed_edits(stack)[0])
-    context = Context(stage, time, stacks, edits, read_payload, listed)
-    findings = []
-    for rule in RULES:
-        for prim, name, message in rule.find(context):
-            findings.append(EditFinding(str(prim.GetPath()), name, message, rule.severity, type(rule).__name__))
-    return findings
+    with quiet_usd():  # USD warns on stderr about dropped targets, each time it composes them.
+        everything = list(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
+        stacks = tuple(prim for prim in everything if schema.has_schema(prim, schema.STACK_API))
+        edits = tuple(prim for prim in everything if schema.has_schema(prim, schema.EDIT_API))
+        listed = frozenset(str(prim.GetPath()) for stack in stacks for prim in listed_edits(stack)[0])
+        context = Context(stage, time, stacks, edits, read_payload, listed)
+        return [
+            EditFinding(str(prim.GetPath()), name, message, rule.severity, type(rule).__name__)
+            for rule in RULES
+            for prim, name, message in rule.find(context)
+        ]
 
 
 # --------------------------------------------------------------------------- schemas

@@ -214,7 +214,7 @@ def test_a_rule_finds_its_mistake_and_no_other_rule_does(
     assert all(finding.severity == severity for finding in findings)
 
 
-def test_targets_that_a_reference_drops_are_found(stage: Usd.Stage) -> None:
+def test_targets_that_a_reference_drops_are_found(stage: Usd.Stage, capfd: pytest.CaptureFixture[str]) -> None:
     includes = f"{WARM}.collection:{schema.CASTERS}:includes"
     layer(stage, "seq.usda").GetRelationshipAtPath(includes).targetPathList.appendedItems.append(
         Sdf.Path("/Other/prim")
@@ -227,6 +227,7 @@ def test_targets_that_a_reference_drops_are_found(stage: Usd.Stage) -> None:
         ("/Show/set/indirect/warm", f"collection:{schema.CASTERS}:includes")
     ]
     assert "/Other/prim in" in dropped[0].message and dropped[0].severity == Severity.ERROR
+    assert capfd.readouterr().err == ""
 
 
 def test_a_reader_that_refuses_a_payload_is_quoted(stage: Usd.Stage) -> None:
