@@ -14,7 +14,7 @@ from icheat_usd.errors import ImageError
 
 #: The configuration used when ``$OCIO`` is not set. Pinned, so that an image does not change with the library; this
 #: one because every OpenColorIO from 2.3 (VFX Reference Platform CY2024) carries it, and because its ACES 1.3 views
-#: cost a tenth of the ACES 2 views, which take a second per HD frame on one core.
+#: take a third of the time of the ACES 2 views of newer ones (measured at 640 x 480).
 BUILTIN_CONFIG = "ocio://cg-config-v2.1.0_aces-v1.3_ocio-v2.3"
 WORKING_SPACE = "Linear Rec.709 (sRGB)"
 
