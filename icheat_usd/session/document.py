@@ -242,6 +242,7 @@ class Session:
         frame: float | None = None,
         before: str | None = None,
         after: str | None = None,
+        sidecar: str | Path | None = None,
     ) -> str:
         """Add an edit to the stack and save the layer; a stack is made if the stage has none.
 
@@ -257,6 +258,8 @@ class Session:
             Soft weights by position, painted on the selected surfaces; see `edits.painting`.
         frame : float, optional
             Time of the key; without it the edit holds at all times.
+        sidecar : path, optional
+            Folder or file for the payload; beside the layer's file by default.
 
         Returns
         -------
@@ -286,6 +289,7 @@ class Session:
             frame=frame,
             before=before,
             after=after,
+            sidecar=sidecar,
         )
 
     def _paint(self, selected: Members | Sequence[str], brush: Brush | None) -> SurfaceMask | None:
