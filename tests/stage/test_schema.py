@@ -120,3 +120,11 @@ def test_the_locator_prints_an_absolute_directory_without_loading_usd() -> None:
         [sys.executable, "-W", "error", "-m", "icheat_usd.plugin_path"], capture_output=True, text=True, cwd=REPOSITORY
     )
     assert (done.stdout.strip(), done.stderr) == (directory, "")
+
+
+def test_reading_and_authoring_edits_needs_no_compiler_and_no_image_library() -> None:
+    code = (
+        "import sys, icheat_usd.stage.authoring, icheat_usd.stage.check\n"
+        "print([name for name in ('numba', 'h5py', 'OpenImageIO', 'OpenEXR', 'embreex') if name in sys.modules])"
+    )
+    assert python(code).strip() == "[]"
