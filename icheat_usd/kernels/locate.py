@@ -16,99 +16,108 @@ _AGREE = np.float32(0.5)  # normals at least 60 degrees apart belong to differen
 
 
 class LocatorTable(NamedTuple):
-    """Everything a look-up reads."""
+    """Everything a look-up reads, laid out so that a step down the tree touches one cache line."""
 
-    position: NDArray[np.float32]  #: (n, 3) of the samples, in tree order
-    normal: NDArray[np.float32]  #: (n, 3)
-    lo: NDArray[np.int32]  #: (n_nodes,)
-    mid: NDArray[np.int32]
-    hi: NDArray[np.int32]
-    box: NDArray[np.float32]  #: (n_nodes, 6) lowest and highest corner
+    sample: NDArray[np.float32]  #: (n, 6) position and normal, in tree order
+    record: NDArray[np.float32]  #: (n_records, 16) of nodes with more than `BUCKET` samples: for the left child
+    #: lowest corner, highest corner, what it is, how many; the same for the right. What it is: the
+    #: row of its own record, or -1 - its first sample. Integers below 2^24 are exact in float32.
     slot: NDArray[np.int32]  #: (n_instances * 2,) group of samples of ``2 * instance + side``
     slot_begin: NDArray[np.int32]  #: (n_slots + 1,) its samples
-    slot_node: NDArray[np.int32]  #: (n_slots,) its node, or -1 where it has one sample
+    slot_record: NDArray[np.int32]  #: (n_slots,) its record, or -1 where it has none
 
 
 @kernel
-def build_boxes(position, lo, mid, hi, box):  # type: ignore[no-untyped-def]
-    """Bounds of every node's samples."""
+def number_records(lo, hi, out):  # type: ignore[no-untyped-def]
+    """Rows of the records of nodes (-1 for those without), in pre-order; returns how many there are."""
+    count = 0
+    for node in range(len(lo)):
+        out[node] = -1
+        if hi[node] - lo[node] > BUCKET:
+            out[node] = count
+            count += 1
+    return count
+
+
+@kernel
+def build_records(position, lo, mid, hi, row, box, record):  # type: ignore[no-untyped-def]
+    """Fill the records; `box` (n_nodes, 6) receives the bounds of every node's samples."""
     for step in range(len(lo)):
         node = len(lo) - 1 - step
         for c in range(3):
-            low = np.float32(np.inf)
-            high = np.float32(-np.inf)
-            for side in range(2):
-                begin = lo[node] if side == 0 else mid[node]
-                end = mid[node] if side == 0 else hi[node]
-                if end - begin == 1:
-                    low = min(low, position[begin, c])
-                    high = max(high, position[begin, c])
-                else:
-                    child = node + 1 if side == 0 else node + mid[node] - lo[node]
-                    low = min(low, box[child, c])
-                    high = max(high, box[child, c + 3])
-            box[node, c] = low
-            box[node, c + 3] = high
+            box[node, c] = np.inf
+            box[node, c + 3] = -np.inf
+        for side in range(2):
+            begin = lo[node] if side == 0 else mid[node]
+            end = mid[node] if side == 0 else hi[node]
+            child = node + 1 if side == 0 else node + mid[node] - lo[node]
+            for c in range(3):
+                low = position[begin, c] if end - begin == 1 else box[child, c]
+                high = position[begin, c] if end - begin == 1 else box[child, c + 3]
+                box[node, c] = min(box[node, c], low)
+                box[node, c + 3] = max(box[node, c + 3], high)
+                if row[node] >= 0:
+                    record[row[node], 8 * side + c] = low
+                    record[row[node], 8 * side + 3 + c] = high
+            if row[node] >= 0:
+                inner = end - begin > BUCKET
+                record[row[node], 8 * side + 6] = row[child] if inner else -1 - begin
+                record[row[node], 8 * side + 7] = end - begin
 
 
 @kernel
-def _box_distance(box, node, x, y, z):  # type: ignore[no-untyped-def]
+def _box_distance(record, r, first, x, y, z):  # type: ignore[no-untyped-def]
     zero = np.float32(0.0)
-    dx = max(max(box[node, 0] - x, x - box[node, 3]), zero)
-    dy = max(max(box[node, 1] - y, y - box[node, 4]), zero)
-    dz = max(max(box[node, 2] - z, z - box[node, 5]), zero)
+    dx = max(max(record[r, first] - x, x - record[r, first + 3]), zero)
+    dy = max(max(record[r, first + 1] - y, y - record[r, first + 4]), zero)
+    dz = max(max(record[r, first + 2] - z, z - record[r, first + 5]), zero)
     return dx * dx + dy * dy + dz * dz
 
 
 @kernel
 def _nearest(table, begin, end, root, x, y, z, nx, ny, nz, agree, stack, bound):  # type: ignore[no-untyped-def]
     """Nearest sample of ``begin:end`` whose normal agrees by more than `agree`; -1 if none does."""
+    record, sample = table.record, table.sample
     best = np.int64(-1)
     best_distance = np.float32(np.inf)
     depth = 0
-    if end - begin <= BUCKET:
-        scan_lo, scan_hi = np.int64(begin), np.int64(end)
-        node = np.int64(-1)
-    else:
-        scan_lo, scan_hi = np.int64(0), np.int64(0)
-        node = np.int64(root)
+    # What is to be visited: a record, or -1 - the first of `count` samples.
+    what, count = (np.int64(root), np.int64(0)) if root >= 0 else (np.int64(-1 - begin), np.int64(end - begin))
     while True:
-        while node >= 0:
-            lo, mid, hi = np.int64(table.lo[node]), np.int64(table.mid[node]), np.int64(table.hi[node])
-            if hi - lo <= BUCKET:
-                scan_lo, scan_hi = lo, hi
-                break
-            left = node + 1
-            right = node + mid - lo
-            d_left = _box_distance(table.box, left, x, y, z)
-            d_right = _box_distance(table.box, right, x, y, z)
+        while what >= 0:
+            r = what
+            d_left = _box_distance(record, r, 0, x, y, z)
+            d_right = _box_distance(record, r, 8, x, y, z)
             # Equal distances are still visited: the lower index wins a tie, wherever it lies.
-            if d_left <= d_right:
-                near, far, d_near, d_far = left, right, d_left, d_right
-            else:
-                near, far, d_near, d_far = right, left, d_right, d_left
+            near, far = (0, 8) if d_left <= d_right else (8, 0)
+            d_far = max(d_left, d_right)
             if d_far <= best_distance:
-                stack[depth] = far
+                stack[depth, 0] = np.int64(record[r, far + 6])
+                stack[depth, 1] = np.int64(record[r, far + 7])
                 bound[depth] = d_far
                 depth += 1
-            node = near if d_near <= best_distance else np.int64(-1)
-        for j in range(scan_lo, scan_hi):
-            dx = table.position[j, 0] - x
-            dy = table.position[j, 1] - y
-            dz = table.position[j, 2] - z
+            if min(d_left, d_right) <= best_distance:
+                what = np.int64(record[r, near + 6])
+                count = np.int64(record[r, near + 7])
+            else:
+                what, count = np.int64(-1), np.int64(0)
+        for j in range(-1 - what, -1 - what + count):
+            dx = sample[j, 0] - x
+            dy = sample[j, 1] - y
+            dz = sample[j, 2] - z
             d = dx * dx + dy * dy + dz * dz
             if d < best_distance or (d == best_distance and j < best):
-                if table.normal[j, 0] * nx + table.normal[j, 1] * ny + table.normal[j, 2] * nz > agree:
+                if sample[j, 3] * nx + sample[j, 4] * ny + sample[j, 5] * nz > agree:
                     best_distance = d
-                    best = j
-        scan_lo, scan_hi = np.int64(0), np.int64(0)
-        node = np.int64(-1)
+                    best = np.int64(j)
+        found = False
         while depth > 0:
             depth -= 1
             if bound[depth] <= best_distance:
-                node = stack[depth]
+                what, count = stack[depth, 0], stack[depth, 1]
+                found = True
                 break
-        if node < 0:
+        if not found:
             return best
 
 
@@ -119,7 +128,7 @@ def nearest_sample(table, instance, side, x, y, z, nx, ny, nz, stack, bound):  #
     begin, end = table.slot_begin[slot], table.slot_begin[slot + 1]
     if end - begin == 1:
         return np.int64(begin)
-    root = table.slot_node[slot]
+    root = table.slot_record[slot]
     best = _nearest(table, begin, end, root, x, y, z, nx, ny, nz, _AGREE, stack, bound)
     if best < 0:
         best = _nearest(table, begin, end, root, x, y, z, nx, ny, nz, np.float32(-2.0), stack, bound)
@@ -131,7 +140,7 @@ def locate(table, depth, position, normal, instance, side, out):  # type: ignore
     """Sample of each place; -1 where ``instance`` is."""
     n = len(instance)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
-        stack = np.empty(depth + 1, np.int64)
+        stack = np.empty((depth + 1, 2), np.int64)
         bound = np.empty(depth + 1, np.float32)
         for q in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
             if instance[q] < 0:

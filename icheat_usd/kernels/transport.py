@@ -35,7 +35,7 @@ def cells_of_hits(  # type: ignore[no-untyped-def]
     """
     n = len(instance)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
-        stack = np.empty(depth + 1, np.int64)
+        stack = np.empty((depth + 1, 2), np.int64)
         bound = np.empty(depth + 1, np.float32)
         for q in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
             i, t = instance[q], triangle[q]

@@ -17,7 +17,7 @@ from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
 _PILOT_POINTS = 16384
-_PILOT_RAYS = 8  # per point: enough to see a surface that fills a millionth of what all points see
+_PILOT_RAYS = 1 << 17  # in all: enough to find a surface that fills a 10,000th of what all points see
 _AREA_SHARE = 0.2  # of the samples by area alone: what the pilot missed still gets some
 _UNSEEN_SHARE = 0.25  # of the samples at most, for sides that the pilot never saw
 _CELLS_AT_ONCE = 16384  # of direct light, to bound memory
@@ -178,8 +178,11 @@ def _pilot(snapshot: SceneSnapshot, tracer: Tracer, view: ViewSamples, seed: int
     step = max(1, view.n // _PILOT_POINTS)
     points = take_points(view.points, np.arange(step // 2, view.n, step))
     weight = np.ones(len(points.instance))
-    for bounce, n_rays in enumerate((_PILOT_RAYS, 1)):
-        n = len(points.instance)
+    rays_per_point = min(1024, max(1, _PILOT_RAYS // len(weight)))
+    for bounce, n_rays in enumerate((rays_per_point, 1)):
+        if not len(weight):
+            break
+        n = len(weight)
         origins, directions = np.empty((n * n_rays, 3), np.float32), np.empty((n * n_rays, 3), np.float32)
         start = np.empty(n * n_rays, np.int64)
         kernels.cosine_rays(
@@ -219,10 +222,10 @@ def _share_out(snapshot: SceneSnapshot, area: F64, importance: F64, n: int) -> _
         shared = min(shared, len(ranked) - wanted)
     own, rest = ranked[:wanted], np.sort(ranked[wanted:])
 
-    name = [_name(snapshot, side) for side in own]
+    name = [_name(snapshot, side) for side in own.tolist()]
     members = [own[i : i + 1] for i in range(len(own))]
     if shared:
-        rest = rest[sorted(range(len(rest)), key=lambda i: _name(snapshot, rest[i]))]
+        rest = np.array(sorted(rest.tolist(), key=lambda side: _name(snapshot, side)))
         for cluster, group in enumerate(np.array_split(rest, shared)):
             name.append(("~shared", f"{cluster:08d}"))
             members.append(group)

@@ -59,18 +59,19 @@ def build_locator(position: F32, normal: F32, shape: TreeShape, depth: int, slot
     slot_begin : (n_groups + 1,)
         Samples of each group, as the tree was built.
     """
-    box = np.empty((len(shape.lo), 6), np.float32)
     position = np.require(position, np.float32, ["C", "W"])
-    kernels.build_boxes(position, shape.lo, shape.mid, shape.hi, box)
+    row = np.empty(len(shape.lo), np.int32)
+    record = np.empty((kernels.number_records(shape.lo, shape.hi, row), 16), np.float32)
+    box = np.empty((len(shape.lo), 6), np.float32)
+    kernels.build_records(position, shape.lo, shape.mid, shape.hi, row, box, record)
+    slot_record = np.full(len(shape.group_node), -1, np.int32)
+    inner = shape.group_node >= 0
+    slot_record[inner] = row[shape.group_node[inner]]
     table = kernels.LocatorTable(
-        position,
-        np.require(normal, np.float32, ["C", "W"]),
-        shape.lo,
-        shape.mid,
-        shape.hi,
-        box,
+        np.concatenate([position, normal.astype(np.float32)], axis=1),
+        record,
         np.ascontiguousarray(slot, np.int32),
         slot_begin.astype(np.int32),
-        shape.group_node,
+        slot_record,
     )
     return Locator(table, depth)

@@ -1,0 +1,74 @@
+"""Sparse products and their compressed twin against dense ones."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from icheat_usd.samples.tree import build_tree, split_samples
+from icheat_usd.transport import SparseRows, compress_rows
+from icheat_usd.transport.sparse import concatenate_rows
+
+
+def random_rows(n_rows: int, n_columns: int, seed: int = 0) -> tuple[SparseRows, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    dense = np.where(rng.random((n_rows, n_columns)) < 0.15, rng.random((n_rows, n_columns)), 0).astype(np.float32)
+    dense[n_rows // 2] = 0
+    row, column = np.nonzero(dense)
+    indptr = np.searchsorted(row, np.arange(n_rows + 1)).astype(np.int64)
+    return SparseRows(indptr, column.astype(np.int32), dense[row, column], n_columns), dense
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 7])
+def test_product_equals_the_dense_one(k: int) -> None:
+    rows, dense = random_rows(40, 90)
+    b = np.random.default_rng(1).random((90, k)).astype(np.float32)
+    np.testing.assert_allclose(rows.matmul(b), dense @ b, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rows.row_sums(), dense.sum(1), rtol=1e-6)
+
+
+def test_product_has_the_same_bits_for_any_number_of_threads() -> None:
+    rows, _ = random_rows(500, 90)
+    b = np.random.default_rng(1).random((90, 3)).astype(np.float32)
+    both = []
+    for threads in (1, 2):
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        both.append(rows.matmul(b))
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert np.array_equal(*both)
+
+
+def test_product_refuses_the_wrong_number_of_columns() -> None:
+    rows, _ = random_rows(4, 9)
+    with pytest.raises(ValueError, match="shape"):
+        rows.matmul(np.zeros((8, 3), np.float32))
+
+
+def test_parts_of_a_matrix_stack_up_to_it_again() -> None:
+    rows, _ = random_rows(40, 90)
+    again = concatenate_rows([rows.rows(0, 7), rows.rows(7, 7), rows.rows(7, 40)], 90)
+    assert np.array_equal(again.indptr, rows.indptr)
+    assert np.array_equal(again.indices, rows.indices)
+    assert np.array_equal(again.weights, rows.weights)
+
+
+def test_compression_is_exact_with_all_coefficients_and_better_with_more() -> None:
+    rng = np.random.default_rng(4)
+    n = 130
+    position = rng.random((n, 3)).astype(np.float32)
+    begin = np.array([0, 50, n], np.int64)
+    shape = split_samples([("a",), ("b",)], begin, position, np.zeros((n, 3), np.float32))
+    area = rng.uniform(0.1, 2, n)
+    tree = build_tree(shape, area, b"")
+    rows, dense = random_rows(60, n)
+    b = (1 + position[shape.order]).astype(np.float32)
+    errors = []
+    for k in (5, 20, 60, n):
+        compressed = compress_rows(rows, tree, area, k)
+        assert np.diff(compressed.coefficients.indptr).max() <= k
+        errors.append(np.abs(compressed.matmul(b) - dense @ b).max())
+    assert errors[-1] < 1e-4 * (dense @ b).max()
+    assert errors == sorted(errors, reverse=True)
+    with pytest.raises(ValueError, match="another cluster tree"):
+        compress_rows(rows, tree, area + 1, 5)
