@@ -361,10 +361,11 @@ def remove_edit(stage: Usd.Stage, stack: str, edit: str, *, layer: str | Sdf.Lay
                 if spec.layer != target and path in spec.targetPathList.GetAddedOrExplicitItems()
             ]
             raise EditError(f"{path} is listed by {', '.join(stronger)}, which is stronger; remove it there")
-        others = [spec for spec in relationship.GetPropertyStack() if spec.layer != target]
-        if not any(path in spec.targetPathList.GetAddedOrExplicitItems() for spec in others):
-            own = target.GetRelationshipAtPath(relationship.GetPath())
-            own.targetPathList.deletedItems.remove(path)
+        items = target.GetRelationshipAtPath(relationship.GetPath()).targetPathList
+        if not items.isExplicit:
+            items.deletedItems.remove(path)
+            if path in relationship.GetTargets():  # A weaker layer lists it, so that the deletion is needed.
+                items.deletedItems.append(path)
         if target.GetPrimAtPath(path):
             stage.RemovePrim(path)
 

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom
 
 from icheat_usd.edits.model import Blend
@@ -287,6 +289,35 @@ def test_moving_keeps_edits_that_a_weaker_layer_adds_later(stage: Usd.Stage) -> 
     assert [name for name in targets(stage) if name != "e"] == ["d", "b", "c", "a"]
 
 
+@settings(max_examples=40, deadline=None)
+@given(
+    n_sequence=st.integers(0, 4),
+    n_shot=st.integers(0, 4),
+    moves=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7), st.booleans()), max_size=5),
+)
+def test_any_moves_in_a_shot_give_the_order_asked_for(
+    n_sequence: int, n_shot: int, moves: list[tuple[int, int, bool]]
+) -> None:
+    stage = Usd.Stage.CreateInMemory()
+    sequence = Sdf.Layer.CreateAnonymous("sequence")
+    stage.GetRootLayer().subLayerPaths.append(sequence.identifier)
+    stage.SetDefaultPrim(stage.DefinePrim("/World"))
+    create_stack(stage, "indirect", layer=sequence)
+    for i in range(n_sequence):
+        add_edit(stage, STACK, f"e{i}", layer=sequence)
+    for i in range(n_sequence, n_sequence + n_shot):
+        add_edit(stage, STACK, f"e{i}", layer=stage.GetRootLayer())
+    wanted = [f"e{i}" for i in range(n_sequence + n_shot)]
+    for moved, other, is_before in moves:
+        if max(moved, other) >= len(wanted) or moved == other:
+            continue
+        name, place = f"e{moved}", f"e{other}"
+        move_edit(stage, STACK, name, layer=stage.GetRootLayer(), **{"before" if is_before else "after": place})
+        wanted.remove(name)
+        wanted.insert(wanted.index(place) + (not is_before), name)
+        assert targets(stage) == wanted
+
+
 def test_moving_against_a_stronger_layer_is_refused(stage: Usd.Stage) -> None:
     for name in ("a", "b"):
         add(stage, name)
@@ -369,6 +400,36 @@ def test_a_payload_for_all_times_replaces_the_keys(stage: Usd.Stage, tmp_path: P
     set_payload_key(stage, path, layer="seq.usda", time=None, payload=(sidecar, OTHER))
     track = read_keys(stage.GetPrimAtPath(path))
     assert track is not None and [(key.time, key.digest) for key in track.keys] == [(None, OTHER)]
+
+
+def test_a_shot_edits_what_it_references(stage: Usd.Stage, tmp_path: Path) -> None:
+    sidecar = tmp_path / "edits.v001.icheat.h5"
+    add(stage, "warm", payload=(sidecar, DIGEST), time=102)
+    add(stage, "cool")
+    for name in ("seq.usda", "shot.usda"):
+        save_layer(layer(stage, name))
+    (tmp_path / "show").mkdir()
+    outer = Usd.Stage.CreateNew(str(tmp_path / "show" / "outer.usda"))
+    UsdGeom.SetStageUpAxis(outer, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(outer, 1.0)
+    outer.SetDefaultPrim(UsdGeom.Xform.Define(outer, "/Show").GetPrim())
+    reference = Sdf.Reference("../shot.usda", layerOffset=Sdf.LayerOffset(1000, 1))
+    UsdGeom.Xform.Define(outer, "/Show/set").GetPrim().GetReferences().AddReference(reference)
+    stack, edit = "/Show/set/indirect", "/Show/set/indirect/warm"
+    move_edit(outer, stack, "cool", layer="outer.usda", before="warm")
+    set_payload_key(outer, edit, layer="outer.usda", time=1122, payload=(sidecar, OTHER))
+    track = read_keys(outer.GetPrimAtPath(edit))
+    assert track is not None
+    assert [(key.time, key.digest, key.file) for key in track.keys] == [
+        (1102.0, DIGEST, "../edits.v001.icheat.h5"),
+        (1122.0, OTHER, "../edits.v001.icheat.h5"),
+    ]
+    assert [finding.rule for finding in check_stage(outer)] == []
+    composed = outer.GetPrimAtPath(stack).GetRelationship(schema.EDITS)
+    assert [path.name for path in composed.GetTargets()] == ["cool", "warm"]
+    remove_edit(outer, stack, "cool", layer="outer.usda")
+    assert [path.name for path in composed.GetTargets()] == ["warm"]
+    assert not stock_findings(outer)
 
 
 # --------------------------------------------------------------------------- saving
