@@ -10,8 +10,8 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from icheat_usd.scene import F64, I64
-from icheat_usd.stage.meshes import DEFAULT_COLOR, FaceMaterials, TriangleMesh, topology_digest, unit_normals
-from icheat_usd.stage.polygons import degenerate, face_parametrisation, triangulate
+from icheat_usd.stage.meshes import DEFAULT_COLOR, FaceMaterials, TriangleMesh, measure, topology_digest, unit_normals
+from icheat_usd.stage.polygons import face_parametrisation, triangulate
 from icheat_usd.stage.primvars import find_primvar
 from icheat_usd.stage.reporting import Reporter
 
@@ -78,22 +78,22 @@ def read_implicit(
         if kind == "Sphere":
             order = _AXES["Z"]
     points, counts, indices, normals, st = shape
-    points, normals = points[:, order], normals[:, order]
+    points, normals = np.ascontiguousarray(points[:, order]), normals[:, order]
 
     corners, face = triangulate(points, counts, indices)
     if orientation == "leftHanded":
-        corners, normals = corners[:, [0, 2, 1]], -normals
-    triangles = points[indices[corners]]
-    good = ~degenerate(triangles)
+        corners, normals = np.ascontiguousarray(corners[:, [0, 2, 1]]), -normals
+    vertex = indices[corners]
+    flat, good = measure(points, vertex)
     if not good.any():
         report(prim, "implicit shape", f"this {kind} has no area; left out.")
         return None
-    corners, face, triangles = corners[good], face[good], triangles[good]
+    corners, face, vertex, flat = corners[good], face[good], vertex[good], flat[good]
     return TriangleMesh(
-        points=triangles.astype(np.float32),
-        normals=unit_normals(normals[corners], triangles),
+        points=points[vertex].astype(np.float32),
+        normals=unit_normals(normals, corners, flat),
         st=st[corners].astype(np.float32),
-        color=np.broadcast_to(np.array(color, np.float32), triangles.shape).copy(),
+        color=np.broadcast_to(np.array(color, np.float32), (len(face), 3, 3)).copy(),
         face=face.astype(np.int32),
         face_uv=face_parametrisation(counts)[corners].astype(np.float32),
         material=np.full(len(face), materials.row, np.int32),

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
+from icheat_usd.kernels import meshing
 from icheat_usd.scene import F32, F64, I32, I64
-from icheat_usd.stage.polygons import corner_normals, degenerate, face_parametrisation, triangulate
+from icheat_usd.stage.polygons import THINNEST, face_parametrisation, triangulate
 from icheat_usd.stage.primvars import MeshValues, Topology, expand, find_primvar, read_primvar
 from icheat_usd.stage.reporting import Reporter
 from icheat_usd.stage.subdivision import Cage, refine
@@ -181,41 +182,48 @@ def _build(control: _ControlMesh) -> TriangleMesh | None:
 
     # Triangles -----------------------------------------------------------
     origin = _origin(cage.vertices[:, :3])
-    positions = cage.vertices[:, :3] - origin
+    positions = np.ascontiguousarray(cage.vertices[:, :3] - origin)
     corners, triangle_face = triangulate(positions, cage.counts, cage.indices)
     if control.left_handed:
-        corners = corners[:, [0, 2, 1]]
+        corners = np.ascontiguousarray(corners[:, [0, 2, 1]])
         vertex_normals = None if vertex_normals is None else -vertex_normals
     vertex = cage.indices[corners]
-    triangles = positions[vertex]
-    good = ~degenerate(triangles)
+    flat, good = measure(positions, vertex)
     if not good.any():
         return None
     if not good.all():
-        corners, triangle_face, vertex, triangles = corners[good], triangle_face[good], vertex[good], triangles[good]
+        corners, triangle_face, vertex, flat = corners[good], triangle_face[good], vertex[good], flat[good]
     control_face = cage.face[triangle_face]
 
-    def gather(name: str) -> F64 | None:
+    def gather(name: str, width: int) -> F32 | None:
         if name not in places:
             return None
-        on_vertices, begin, end = places[name]
-        return cage.vertices[vertex, begin:end] if on_vertices else cage.corners[corners, begin:end]
+        on_vertices, begin, _ = places[name]
+        return take(cage.vertices, vertex, begin, width) if on_vertices else take(cage.corners, corners, begin, width)
 
-    st = np.zeros((len(triangles), 3, 2), np.float32)
+    st = np.zeros((len(vertex), 3, 2), np.float32)
     for which in np.unique(control.st_column):
-        values = gather(f"st {which}")
+        values = gather(f"st {which}", 2)
         if values is not None:
             chosen = control.st_column[control_face] == which
             st[chosen] = values[chosen]
-    color = gather("displayColor")
-    normals = vertex_normals[vertex] if vertex_normals is not None else gather("normals")
+    color = gather("displayColor", 3)
+    if vertex_normals is not None:
+        normals = unit_normals(vertex_normals, vertex, flat)
+    elif "normals" in places:
+        on_vertices, begin, end = places["normals"]
+        source = (cage.vertices if on_vertices else cage.corners)[:, begin:end]
+        normals = unit_normals(source, vertex if on_vertices else corners, flat)
+    else:
+        normals = np.repeat(flat.astype(np.float32)[:, None], 3, axis=1)
+    face_uv = take(cage.corners, corners, 0, 2)
     return TriangleMesh(
-        points=triangles.astype(np.float32),
-        normals=unit_normals(normals, triangles),
+        points=take(positions, vertex, 0, 3),
+        normals=normals,
         st=st,
-        color=np.full((len(triangles), 3, 3), DEFAULT_COLOR, np.float32) if color is None else color.astype(np.float32),
+        color=np.full((len(vertex), 3, 3), DEFAULT_COLOR, np.float32) if color is None else color,
         face=control_face.astype(np.int32),
-        face_uv=np.clip(cage.corners[corners, :2], 0.0, 1.0).astype(np.float32),
+        face_uv=np.clip(face_uv, 0.0, 1.0, out=face_uv),
         material=control.rows[control_face],
         double_sided=control.double_sided,
         n_faces=control.n_faces,
@@ -224,16 +232,25 @@ def _build(control: _ControlMesh) -> TriangleMesh | None:
     )
 
 
-def unit_normals(normals: F64 | None, triangles: F64) -> F32:
-    """Unit normals per corner ``(n, 3, 3) float32``; the triangle's own where none is given or one has no length."""
-    flat = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
-    if normals is None:
-        return np.ascontiguousarray(np.broadcast_to(flat[:, None, :], triangles.shape), dtype=np.float32)
-    length = np.linalg.norm(normals, axis=2, keepdims=True)
-    usable = length > 1e-30
-    unit = np.where(usable, normals / np.where(usable, length, 1.0), flat[:, None, :])
-    return unit.astype(np.float32)
+def take(values: F64, rows: I64, begin: int, width: int) -> F32:
+    """Columns `begin` to `begin` + `width` of `values` at the corners of triangles, ``(n, 3, width)``."""
+    taken = np.empty((*rows.shape, width), np.float32)
+    meshing.take(values, begin, rows, taken)
+    return taken
+
+
+def measure(positions: F64, vertex: I64) -> tuple[F64, NDArray[np.bool_]]:
+    """Unit normals ``(n, 3)`` of triangles, and which of them have an area to speak of."""
+    flat, good = np.empty((len(vertex), 3)), np.empty(len(vertex), np.uint8)
+    meshing.measure_triangles(positions, vertex, THINNEST, flat, good)
+    return flat, good.view(np.bool_)
+
+
+def unit_normals(values: F64, rows: I64, flat: F64) -> F32:
+    """Unit normals at the corners of triangles, ``(n, 3, 3)``; `flat`, the triangle's own, where one has no length."""
+    normals = np.empty((*rows.shape, 3), np.float32)
+    meshing.unit_normals(np.ascontiguousarray(values), rows, flat, normals)
+    return normals
 
 
 def _read_control_mesh(
@@ -363,9 +380,9 @@ def _only(cage: Cage, kept: NDArray[np.bool_]) -> Cage:
 
 def _smooth_normals(cage: Cage) -> F64:
     """Area-weighted mean of the faces' normals at each vertex; not unit."""
-    turns = corner_normals(cage.vertices[cage.indices, :3], cage.counts)
-    n = len(cage.vertices)
-    return np.stack([np.bincount(cage.indices, turns[:, k], n) for k in range(3)], axis=1)
+    normals = np.empty((len(cage.vertices), 3))
+    meshing.vertex_normals(cage.vertices, np.concatenate([[0], np.cumsum(cage.counts)]), cage.indices, normals)
+    return normals
 
 
 def _origin(points: F64) -> F64:

@@ -5,35 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from icheat_usd.kernels import meshing
 from icheat_usd.scene import F64, I64
 
 #: A triangle whose height is below this share of its longest edge is thinner than float32 can place it.
 THINNEST = 1e-8
-
-
-def next_corners(counts: I64) -> I64:
-    """Row of the corner after each corner, around its own face."""
-    following = np.arange(1, int(counts.sum()) + 1)
-    ends = np.cumsum(counts)
-    filled = counts > 0
-    following[ends[filled] - 1] = (ends - counts)[filled]
-    return following
-
-
-def previous_corners(counts: I64) -> I64:
-    """Row of the corner before each corner, around its own face."""
-    preceding = np.arange(-1, int(counts.sum()) - 1)
-    ends = np.cumsum(counts)
-    filled = counts > 0
-    preceding[(ends - counts)[filled]] = ends[filled] - 1
-    return preceding
-
-
-def corner_normals(corner_points: F64, counts: I64) -> F64:
-    """Cross product of the two edges at each corner, ``(n_corners, 3)``: twice the area of the corner's triangle."""
-    ahead = corner_points[next_corners(counts)] - corner_points
-    behind = corner_points[previous_corners(counts)] - corner_points
-    return np.cross(ahead, behind)
 
 
 def triangulate(points: F64, counts: I64, indices: I64) -> tuple[I64, I64]:
@@ -71,29 +47,19 @@ def triangulate(points: F64, counts: I64, indices: I64) -> tuple[I64, I64]:
     if not np.any(counts > 3):
         return corners, face
 
-    large = np.flatnonzero(counts > 3)
-    large_counts = counts[large]
-    large_starts = np.cumsum(large_counts) - large_counts
-    rows = np.repeat(starts[large] - large_starts, large_counts) + np.arange(int(large_counts.sum()))
-    corner_points = points[indices[rows]]
-    turns = corner_normals(corner_points, large_counts)
-    relative = corner_points - np.repeat(corner_points[large_starts], large_counts, axis=0)
-    newell = np.add.reduceat(np.cross(relative, relative[next_corners(large_counts)]), large_starts, axis=0)
-    sense = np.einsum("ni,ni->n", turns, np.repeat(newell, large_counts, axis=0))
-    tolerance = 1e-9 * np.repeat(np.einsum("ni,ni->n", newell, newell), large_counts)
-    reflex = sense < -tolerance
-    concave = np.add.reduceat(reflex.astype(np.int64), large_starts) > 0
-
-    quads = large_counts == 4
-    # A concave quad is cut from its reflex corner: the fan around corner 1 where corner 1 or 3 is the reflex one.
-    for i in np.flatnonzero(concave & quads):
-        if reflex[large_starts[i] + 1] or reflex[large_starts[i] + 3]:
-            begin, start = first[large[i]], starts[large[i]]
-            corners[begin : begin + 2] = start + np.array([[1, 2, 3], [1, 3, 0]])
-    for i in np.flatnonzero(concave & ~quads):
-        begin, start, count = first[large[i]], starts[large[i]], int(large_counts[i])
-        flat = _project(relative[large_starts[i] : large_starts[i] + count], newell[i])
-        corners[begin : begin + count - 2] = start + np.array(clip_ears(flat), np.int64)
+    reflex = np.empty(len(counts), np.int64)
+    meshing.find_reflex(points, np.concatenate([[0], np.cumsum(counts)]), indices, reflex)
+    for f in np.flatnonzero(reflex >= 0):
+        begin, start, count = first[f], starts[f], int(counts[f])
+        if count == 4:
+            # A quad is cut from its reflex corner: the fan around corner 1 where corner 1 or 3 is the reflex one.
+            if reflex[f] % 2 == 1:
+                corners[begin : begin + 2] = start + np.array([[1, 2, 3], [1, 3, 0]])
+            continue
+        loop = points[indices[start : start + count]]
+        loop = loop - loop[0]
+        newell = np.cross(loop[1:-1], loop[2:]).sum(axis=0)
+        corners[begin : begin + count - 2] = start + np.array(clip_ears(_project(loop, newell)), np.int64)
     return corners, face
 
 
@@ -158,13 +124,3 @@ def face_parametrisation(counts: I64) -> F64:
     uv[triangle] = np.array([(0, 0), (1, 0), (0, 1)], np.float64)[step[triangle]]
     uv[quad] = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64)[step[quad]]
     return uv
-
-
-def degenerate(triangles: F64) -> NDArray[np.bool_]:
-    """Which of ``(n, 3, 3)`` triangles have no area to speak of."""
-    a = triangles[:, 1] - triangles[:, 0]
-    b = triangles[:, 2] - triangles[:, 0]
-    c = b - a
-    cross = np.cross(a, b)
-    longest = np.maximum(np.maximum((a * a).sum(1), (b * b).sum(1)), (c * c).sum(1))
-    return ~(np.sqrt((cross * cross).sum(1)) > THINNEST * longest)

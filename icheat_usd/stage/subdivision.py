@@ -10,10 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from icheat_usd.scene import F64, I64
-from icheat_usd.stage.polygons import next_corners, previous_corners
+from icheat_usd.kernels import meshing
+from icheat_usd.scene import F64, I64, U8
 
 
 class Cage(NamedTuple):
@@ -24,14 +23,6 @@ class Cage(NamedTuple):
     indices: I64  #: (n_corners,)
     corners: F64  #: (n_corners, m) interpolated linearly within faces
     face: I64  #: (n_faces,) control face
-
-
-class _Edges(NamedTuple):
-    of_corner: I64  #: edge from each corner to the next
-    lo: I64
-    hi: I64
-    n_faces: I64
-    smooth: NDArray[np.bool_]  #: shared by exactly two faces
 
 
 def refine(cage: Cage, level: int, *, smooth: bool = True, sharp_corners: bool = True) -> Cage:
@@ -65,95 +56,64 @@ def refine(cage: Cage, level: int, *, smooth: bool = True, sharp_corners: bool =
     return cage
 
 
-def _find_edges(counts: I64, indices: I64, n_vertices: int) -> _Edges:
-    a, b = indices, indices[next_corners(counts)]
-    key = np.minimum(a, b) * n_vertices + np.maximum(a, b)
-    unique, of_corner, n_faces = np.unique(key, return_inverse=True, return_counts=True)
-    return _Edges(of_corner, unique // n_vertices, unique % n_vertices, n_faces, n_faces == 2)
+class _Topology(NamedTuple):
+    """What one step asks about a cage."""
+
+    starts: I64  #: (n_faces + 1,)
+    of_corner: I64  #: (n_corners,) edge from each corner to the next
+    lo: I64
+    hi: I64
+    n_faces: I64  #: faces at each edge
+    valence: I64  #: faces at each vertex
+    kind: U8  #: 0 smooth, 1 on a boundary curve, 2 fixed
+    neighbours: F64  #: sum of the neighbours along the boundary
 
 
-def _sum_by(rows: I64, values: F64, n: int) -> F64:
-    return np.stack([np.bincount(rows, values[:, k], n) for k in range(values.shape[1])], axis=1)
-
-
-class _Boundary(NamedTuple):
-    edges: I64  #: boundary edges at each vertex
-    neighbours: F64  #: sum of the vertices at their other ends
-    crease: NDArray[np.bool_]  #: two boundary edges pass through
-    corner: NDArray[np.bool_]  #: stays where it is
-
-
-def _find_boundary(cage: Cage, edges: _Edges, valence: I64, sharp_corners: bool) -> _Boundary:
-    n = len(cage.vertices)
-    lo, hi = edges.lo[~edges.smooth], edges.hi[~edges.smooth]
-    count = np.bincount(lo, minlength=n) + np.bincount(hi, minlength=n)
-    neighbours = _sum_by(lo, cage.vertices[hi], n) + _sum_by(hi, cage.vertices[lo], n)
-    crease = count == 2
-    corner = (count > 0) & ~crease
-    if sharp_corners:
-        corner |= crease & (valence == 1)
-        crease &= ~corner
-    return _Boundary(count, neighbours, crease, corner)
+def _analyse(cage: Cage, sharp_corners: bool) -> _Topology:
+    n, n_corners = len(cage.vertices), len(cage.indices)
+    starts = np.concatenate([[0], np.cumsum(cage.counts)])
+    of_corner, lo, hi, n_faces = (np.empty(n_corners, np.int64) for _ in range(4))
+    n_edges = meshing.find_edges(starts, cage.indices, n, of_corner, lo, hi, n_faces)
+    lo, hi, n_faces = lo[:n_edges].copy(), hi[:n_edges].copy(), n_faces[:n_edges].copy()
+    valence = np.bincount(cage.indices, minlength=n)
+    kind, neighbours = np.empty(n, np.uint8), np.empty(cage.vertices.shape)
+    meshing.boundary(cage.vertices, valence, lo, hi, n_faces, sharp_corners, kind, neighbours)
+    return _Topology(starts, of_corner, lo, hi, n_faces, valence, kind, neighbours)
 
 
 def _split(cage: Cage, smooth: bool, sharp_corners: bool) -> Cage:
-    vertices, counts, indices = cage.vertices, cage.counts, cage.indices
-    n, n_faces = len(vertices), len(counts)
-    following, preceding = next_corners(counts), previous_corners(counts)
-    starts = np.cumsum(counts) - counts
-    face_of_corner = np.repeat(np.arange(n_faces), counts)
-    edges = _find_edges(counts, indices, n)
-
-    face_points = np.add.reduceat(vertices[indices], starts, axis=0) / counts[:, None]
-    edge_points = 0.5 * (vertices[edges.lo] + vertices[edges.hi])
-    moved = vertices
-    if smooth:
-        middles = edge_points
-        beside = _sum_by(edges.of_corner, face_points[face_of_corner], len(edges.lo))
-        edge_points = np.where(edges.smooth[:, None], 0.5 * middles + 0.25 * beside, middles)
-
-        valence = np.bincount(indices, minlength=n)
-        around = np.maximum(valence, 1)[:, None]
-        faces_mean = _sum_by(indices, face_points[face_of_corner], n) / around
-        n_edges = np.bincount(edges.lo, minlength=n) + np.bincount(edges.hi, minlength=n)
-        middles_sum = _sum_by(edges.lo, middles, n) + _sum_by(edges.hi, middles, n)
-        middles_mean = middles_sum / np.maximum(n_edges, 1)[:, None]
-        boundary = _find_boundary(cage, edges, valence, sharp_corners)
-        moved = (faces_mean + 2.0 * middles_mean + (around - 3.0) * vertices) / around
-        moved = np.where(boundary.crease[:, None], 0.75 * vertices + 0.125 * boundary.neighbours, moved)
-        moved = np.where((boundary.corner | (valence == 0))[:, None], vertices, moved)
-
-    quads = np.empty((len(indices), 4), np.int64)
-    quads[:, 0] = indices
-    quads[:, 1] = n + edges.of_corner
-    quads[:, 2] = n + len(edges.lo) + face_of_corner
-    quads[:, 3] = n + edges.of_corner[preceding]
-
-    corners = np.empty((len(indices), 4, cage.corners.shape[1]))
-    corners[:, 0] = cage.corners
-    corners[:, 1] = 0.5 * (cage.corners + cage.corners[following])
-    corners[:, 2] = (np.add.reduceat(cage.corners, starts, axis=0) / counts[:, None])[face_of_corner]
-    corners[:, 3] = corners[preceding, 1]
+    t = _analyse(cage, sharp_corners)
+    n, n_edges, n_faces, n_corners = len(cage.vertices), len(t.lo), len(cage.counts), len(cage.indices)
+    vertices = np.empty((n + n_edges + n_faces, cage.vertices.shape[1]))
+    meshing.split_vertices(
+        cage.vertices,
+        t.starts,
+        cage.indices,
+        t.of_corner,
+        t.lo,
+        t.hi,
+        t.n_faces,
+        t.valence,
+        t.kind,
+        t.neighbours,
+        smooth,
+        vertices,
+    )
+    quads = np.empty((n_corners, 4), np.int64)
+    corners = np.empty((n_corners, 4, cage.corners.shape[1]))
+    meshing.split_corners(t.starts, cage.indices, t.of_corner, n, n_edges, cage.corners, quads, corners)
     return Cage(
-        np.concatenate([moved, edge_points, face_points]),
-        np.full(len(indices), 4, np.int64),
+        vertices,
+        np.full(n_corners, 4, np.int64),
         quads.reshape(-1),
-        corners.reshape(-1, corners.shape[2]),
-        cage.face[face_of_corner],
+        corners.reshape(4 * n_corners, -1),
+        np.repeat(cage.face, cage.counts),
     )
 
 
 def _limit(cage: Cage, sharp_corners: bool) -> F64:
     """Where the vertices of an all-quad mesh end up after infinitely many steps."""
-    vertices = cage.vertices
-    n = len(vertices)
-    edges = _find_edges(cage.counts, cage.indices, n)
-    valence = np.bincount(cage.indices, minlength=n)
-    boundary = _find_boundary(cage, edges, valence, sharp_corners)
-    across = cage.indices.reshape(-1, 4)[:, [2, 3, 0, 1]].reshape(-1)
-    diagonals = _sum_by(cage.indices, vertices[across], n)
-    beside = _sum_by(edges.lo, vertices[edges.hi], n) + _sum_by(edges.hi, vertices[edges.lo], n)
-    v = np.maximum(valence, 1)[:, None].astype(np.float64)
-    limit = (v * v * vertices + 4.0 * beside + diagonals) / (v * (v + 5.0))
-    limit = np.where(boundary.crease[:, None], (4.0 * vertices + boundary.neighbours) / 6.0, limit)
-    return np.where((boundary.corner | (valence == 0))[:, None], vertices, limit)
+    t = _analyse(cage, sharp_corners)
+    limit = np.empty_like(cage.vertices)
+    meshing.limit_vertices(cage.vertices, cage.indices, t.lo, t.hi, t.valence, t.kind, t.neighbours, limit)
+    return limit
