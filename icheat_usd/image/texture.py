@@ -8,9 +8,11 @@ from pathlib import PurePath
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icheat_usd.errors import ImageError
-from icheat_usd.scene import F32
+
+F32 = NDArray[np.float32]
 
 
 class StoredImage(NamedTuple):
