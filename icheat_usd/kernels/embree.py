@@ -211,3 +211,38 @@ def occluded_packets(
             _call_packet(function, valid.ctypes.data, scene, rays.ctypes.data)
             for k in range(count):
                 blocked[first + k] = valid[k] != 0 and rays[8, k] < 0.0
+
+
+@parallel_kernel
+def occluded_single(
+    function: int,
+    scene: int,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    t_max: np.ndarray,
+    blocked: np.ndarray,
+) -> None:
+    """Whether anything is hit, one ray per call; `t_max` has n entries or one for all."""
+    n = origins.shape[0]
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
+        storage = np.empty(64, np.float32)
+        shift = np.int64((-storage.ctypes.data % 64) // 4)
+        ray = storage[shift : shift + 12]
+        words = ray.view(np.uint32)
+        address = ray.ctypes.data
+        for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+            limit = t_max[min(i, t_max.shape[0] - 1)]
+            blocked[i] = False
+            if not is_traceable(origins, directions, i, limit):
+                continue
+            for c in range(3):
+                ray[c] = origins[i, c]
+                ray[4 + c] = directions[i, c]
+            ray[3] = 0.0
+            ray[7] = 0.0
+            ray[8] = limit
+            words[9] = _INVALID
+            words[10] = 0
+            words[11] = 0
+            _call_1(function, scene, address)
+            blocked[i] = ray[8] < 0.0

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.materials import shade_hits, take_points
-from icheat_usd.scene import F32, Bool, Hits, Materials, SceneSnapshot, SurfacePoints, Texture
+from icheat_usd.scene import F32, I32, Bool, Hits, Materials, SceneSnapshot, SurfacePoints, Texture
 from icheat_usd.tracing._rays import checked_rays
 from icheat_usd.tracing.protocol import Tracer, spawn_points
 
@@ -35,7 +35,13 @@ def passing_materials(materials: Materials) -> Bool:
 
 
 def first_surfaces(
-    snapshot: SceneSnapshot, tracer: Tracer, origins: F32, directions: F32, seed: int, max_depth: int = 16
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    origins: F32,
+    directions: F32,
+    seed: int,
+    max_depth: int = 16,
+    counters: I32 | None = None,
 ) -> PathEnds:
     """Follow rays over everything that does not scatter them.
 
@@ -48,9 +54,11 @@ def first_surfaces(
     origins, directions : (n, 3) float32
         World space, metres; directions of any length.
     seed : int
-        Random numbers depend on (seed, row, depth) alone.
+        Random numbers depend on (seed, counter, depth) alone.
     max_depth : int
         Deltas along one path before it is given up.
+    counters : (n,) int32
+        One per ray, by default its row: callers that work in blocks number their rays across blocks.
 
     Returns
     -------
@@ -64,6 +72,7 @@ def first_surfaces(
         ray_direction = np.where(length > 0, directions / length, 0).astype(np.float32)
     n = len(origins)
     path = np.arange(n, dtype=np.int32)
+    counter = path if counters is None else np.require(counters, np.int32, ["C", "W"])
     throughput = np.ones((n, 3), np.float32)
     travelled = np.zeros(n, np.float32)
     ends: PathEnds | None = None
@@ -72,7 +81,7 @@ def first_surfaces(
         points = shade_hits(snapshot, hits, ray_direction)
         last = ray_direction.copy()
         state = np.empty(len(path), np.uint8)
-        tracing.step_paths(points, ray_direction, path, int(seed) & 0xFFFFFFFF, depth, throughput, state)
+        tracing.step_paths(points, ray_direction, counter, int(seed) & 0xFFFFFFFF, depth, throughput, state)
         travelled += hits.distance
         followed = state == tracing.FOLLOWED
         absorbed = state == tracing.ABSORBED
@@ -100,7 +109,8 @@ def first_surfaces(
         alive = np.flatnonzero(followed)
         ray_direction = np.ascontiguousarray(ray_direction[alive])
         origins = spawn_points(snapshot, take_points(points, alive), ray_direction)
-        path, throughput, travelled = path[alive], throughput[alive], travelled[alive]
+        path, counter = path[alive], counter[alive]
+        throughput, travelled = throughput[alive], travelled[alive]
     assert ends is not None
     return ends
 

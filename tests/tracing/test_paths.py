@@ -149,6 +149,9 @@ def test_paths_are_the_same_bits_for_a_seed_whatever_runs_beside_them() -> None:
     other = first_surfaces(snapshot, tracer, origins, directions, seed=4)
     assert one.distance.tobytes() == again.distance.tobytes()
     np.testing.assert_allclose(one.distance[:200], fewer.distance, rtol=1e-5)
+    rest = np.arange(200, 500, dtype=np.int32)
+    rest_ends = first_surfaces(snapshot, tracer, origins[200:], directions[200:], seed=3, counters=rest)
+    np.testing.assert_allclose(one.distance[200:], rest_ends.distance, rtol=1e-5)
     assert (one.distance != other.distance).any()
     assert not np.shares_memory(one.direction, directions) and (directions == -origins).all()
 

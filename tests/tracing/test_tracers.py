@@ -12,7 +12,7 @@ import pytest
 from icheat_usd.errors import IcheatError
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
-from icheat_usd.tracing.embree import EmbreeTracer
+from icheat_usd.tracing.embree import INSTANCES_FOR_PACKETS, EmbreeTracer
 from icheat_usd.tracing.reference import ReferenceTracer
 from tests.scenes import Mesh, box, cornell, make_snapshot, quad_scene, rotation, scaling, soup, sphere, translation
 
@@ -22,6 +22,7 @@ ENGINES: dict[str, Build] = {
     "embree with instances": lambda snapshot: EmbreeTracer(snapshot, copied_triangles=0),
     "reference": ReferenceTracer,
 }
+PLACED_FAR_AWAY = [translation(1e4 + i, 0, 0) for i in range(INSTANCES_FOR_PACKETS + 1)]
 
 
 @pytest.fixture(params=ENGINES)
@@ -95,7 +96,7 @@ def test_instances_carry_their_own_number_and_the_rows_of_their_mesh(build: Buil
     np.testing.assert_allclose(hits.distance, [4.75, 4.5, 4.75], rtol=1e-6)
 
 
-@pytest.mark.parametrize("engine", ["embree", "embree with instances"])
+@pytest.mark.parametrize("engine", ["embree", "embree with instances", "single rays"])
 def test_embree_finds_what_the_reference_finds_in_a_soup_of_mirrored_and_skewed_instances(engine: str) -> None:
     skew = np.eye(4)
     skew[0, 1] = 0.7
@@ -104,12 +105,18 @@ def test_embree_finds_what_the_reference_finds_in_a_soup_of_mirrored_and_skewed_
         translation(-1, 0.3, 0) @ scaling(-1, 1, 1),
         translation(0, -1, 0.5) @ skew @ scaling(0.3, 1.7, 0.9),
     ]
-    snapshot = make_snapshot([soup(150, 1), Mesh(soup(60, 2).points, transforms=transforms)])
+    meshes = [soup(150, 1), Mesh(soup(60, 2).points, transforms=transforms)]
+    snapshot = make_snapshot(meshes)
     rng = np.random.default_rng(3)
     origins = rng.uniform(-3, 3, (4000, 3)).astype(np.float32)
     directions = (rng.uniform(-1, 1, (4000, 3)) - origins).astype(np.float32)
     limits = rng.uniform(0.1, 2.0, 4000).astype(np.float32)
-    fast, slow = ENGINES[engine](snapshot), ReferenceTracer(snapshot)
+    slow = ReferenceTracer(snapshot)
+    if engine == "single rays":  # chosen for scenes of many instances: these are out of the way
+        meshes.append(Mesh(box(0.1), transforms=PLACED_FAR_AWAY))
+        fast: Tracer = EmbreeTracer(make_snapshot(meshes), copied_triangles=0)
+    else:
+        fast = ENGINES[engine](snapshot)
     found, expected = fast.intersect(origins, directions, limits), slow.intersect(origins, directions, limits)
     hit = expected.instance >= 0
     assert 0.3 < hit.mean() < 0.95
