@@ -28,7 +28,7 @@ _LAYER = """#usda 1.0
 
 def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", default="demo_output", metavar="FOLDER", help="default demo_output")
-    parser.add_argument("--width", type=positive, default=320, metavar="PIXELS", help="default 320; height follows")
+    parser.add_argument("--width", type=positive, default=256, metavar="PIXELS", help="default 256; height follows")
     parser.add_argument("--preview-only", action="store_true", help="leave out the final gather")
     add_json(parser)
 
@@ -78,7 +78,7 @@ def command(options: argparse.Namespace) -> int:
             "warmPerson",
             layer=str(layer),
             operation="scale",
-            parameters={"color": (1.9, 1.45, 1.1)},
+            parameters={"color": (3.0, 2.0, 1.2)},
             receivers=["Geometry/Person"],
             casters=["Geometry/Rug", "Geometry/Room/Floor"],
             receiver_brush=soft_sphere(chest, inner=0.45, outer=1.0),
@@ -92,7 +92,7 @@ def command(options: argparse.Namespace) -> int:
         ratio = None
         if not options.preview_only:
             began = time.perf_counter()
-            final = session.render(GatherSettings(samples_per_pixel=2, gather_rays=96))
+            final = session.render(GatherSettings(samples_per_pixel=1, gather_rays=64))
             seconds["final gather"] = time.perf_counter() - began
             save(final, "final_after")
             ratio = float(mean_ratio(after.layers["beauty"], final.layers["beauty"]))

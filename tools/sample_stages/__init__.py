@@ -7,8 +7,11 @@ from types import ModuleType
 
 from pxr import Sdf
 
+from icheat_usd.sidecar import list_payloads
+
 from . import animated_room, cornell_box, furnished_room, glossy_set, images, staircase
 from .build import write_over_layer
+from .edits import author_edits
 
 STAGES: dict[str, ModuleType] = {
     module.NAME: module for module in (cornell_box, furnished_room, glossy_set, staircase, animated_room)
@@ -19,8 +22,13 @@ def build_stage(name: str, folder: Path) -> None:
     """Write one sample stage: scene.usda, textures, sequence.usda and shot.usda with their edits."""
     module = STAGES[name]
     module.build(folder)
-    write_over_layer(folder / "sequence.usda", "scene.usda", "", module.FRAMES)
-    write_over_layer(folder / "shot.usda", "sequence.usda", "", module.FRAMES)
+    # Sidecars are write-once: without this a second run would make version 2 of them.
+    for old in folder.glob("*.icheat.h5"):
+        old.unlink()
+    write_over_layer(folder / "sequence.usda", "scene.usda", module.SEQUENCE_DOC, module.FRAMES)
+    author_edits(folder / "sequence.usda", module.SEQUENCE, make_stack=True)
+    write_over_layer(folder / "shot.usda", "sequence.usda", module.SHOT_DOC, module.FRAMES)
+    author_edits(folder / "shot.usda", module.SHOT, make_stack=False)
 
 
 def differences(committed: Path, rebuilt: Path) -> list[str]:
@@ -40,4 +48,6 @@ def _content(path: Path) -> object:
         return Sdf.Layer.OpenAsAnonymous(str(path)).ExportToString()
     if path.suffix == ".png":
         return images.png_content(path.read_bytes())
+    if path.suffix == ".h5":
+        return list_payloads(path)  # their names say their content
     return path.read_bytes()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from . import images
 from .build import StageBuilder
+from .edits import New, Override
 from .figure import Looks, Pose, add_figure
 from .shapes import box, cushion, lathe, quad
 
@@ -17,6 +18,29 @@ walks past the couch. Lights and room stand still; the light that ball, basket a
 send to the floor moves with them, so an edit on it has to be keyed."""
 
 STEP = 3  # frames between samples; linear in between
+
+
+SEQUENCE_DOC = "The sequence: the ball's red on the floor, keyed to swell at its second landing and fade by the end."
+SEQUENCE = (
+    New(
+        "ballGlow",
+        "Red light that the ball sends the floor: as it is, eight times as much at frame 28, as it is again.",
+        receivers=("Geometry/Room/Floor",),
+        casters=("Geometry/Ball",),
+        keys={1.0: {"gain": 1.0}, 28.0: {"gain": 8.0}, 48.0: {"gain": 1.0}},
+    ),
+)
+SHOT_DOC = "The shot: ballGlow at three quarters, and the yellow wall warmer on the person who walks away from it."
+SHOT = (
+    Override("ballGlow", amount=0.75),
+    New(
+        "wallOnPerson",
+        "Light from the yellow wall and the floor on the person.",
+        receivers=("Geometry/Person",),
+        casters=("Geometry/Room/LeftWall", "Geometry/Room/Floor"),
+        parameters={"color": (1.8, 1.5, 1.0)},
+    ),
+)
 
 
 def build(folder: Path) -> None:

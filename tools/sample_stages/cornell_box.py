@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .build import StageBuilder
+from .edits import New, Override
 from .shapes import box, quad
 
 NAME = "cornell_box"
@@ -14,6 +15,38 @@ Variant set "light" on /World: "rect" is a RectLight under the ceiling, "mesh" a
 same size and radiance, so both give the same picture but for the lamp itself, which only the mesh shows."""
 
 RADIANCE = (24.0, 19.5, 14.0)
+
+
+SEQUENCE_DOC = "The sequence: less red from the wall on the blocks, and the short one tinted by hue."
+SEQUENCE = (
+    New(
+        "lessRed",
+        "The red wall sends the blocks a third of its light.",
+        receivers=("Geometry/Blocks",),
+        casters=("Geometry/Room/RedWall",),
+        parameters={"gain": 0.33},
+    ),
+    New(
+        "greenToBlue",
+        "What the green wall sends the short block turns towards blue.",
+        receivers=("Geometry/Blocks/Short",),
+        casters=("Geometry/Room/GreenWall",),
+        operation="hsv",
+        parameters={"hue": 100.0, "value": 1.5},
+    ),
+)
+SHOT_DOC = "The shot: keeps half of lessRed, and lifts the ceiling from the floor in a soft round patch."
+SHOT = (
+    Override("lessRed", amount=0.5),
+    New(
+        "ceilingPatch",
+        "Light from the floor on the middle of the ceiling, more and warmer towards the centre.",
+        receivers=("Geometry/Room/Ceiling",),
+        casters=("Geometry/Room/Floor",),
+        parameters={"color": (2.4, 2.0, 1.5)},
+        receiver_sphere=(0.0, 2.0, 0.0, 0.2, 0.9),
+    ),
+)
 
 
 def build(folder: Path) -> None:

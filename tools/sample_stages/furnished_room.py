@@ -6,15 +6,48 @@ from pathlib import Path
 
 from . import images
 from .build import StageBuilder
+from .edits import New, Override
 from .figure import Looks, add_figure
 from .shapes import box, cushion, lathe, quad, wall_with_hole
 
 NAME = "furnished_room"
 FRAMES = None
-DOC = """A furnished room, 5.2 x 5 m. Sunlight through a window outside the left edge of the picture falls on the rug and
-the low table; the person beside it stands in the shade and is lit by what the rug and floor send on, so a lighter who
-wants the face warmer, or less red from the rug, has no light to turn.
+DOC = """A furnished room, 5.2 x 5 m. Sunlight through a window left of the picture falls on the rug and the low table.
+The person beside it stands in the shade, lit by what rug and floor send on: a lighter who wants the face warmer, or
+less red from the rug, has no light to turn.
 Variant set "sky" on /World: "rect" is a RectLight before the window, "dome" a textured sky that is seen through it."""
+
+
+SEQUENCE_DOC = "The sequence: the rug's red kept off the person, the back wall opened up."
+SEQUENCE = (
+    New(
+        "rugOffPerson",
+        "What the rug sends the person loses most of its red.",
+        receivers=("Geometry/Person",),
+        casters=("Geometry/Rug",),
+        operation="hsv",
+        parameters={"saturation": 0.35},
+    ),
+    New(
+        "openWall",
+        "More light from the floor on the back wall, as if it were paler.",
+        receivers=("Geometry/Room/BackWall",),
+        casters=("Geometry/Room/Floor", "Geometry/Rug"),
+        parameters={"color": (1.5, 1.45, 1.35)},
+    ),
+)
+SHOT_DOC = "The shot: a warm fill on the face, which no light in the room could give alone; openWall held back."
+SHOT = (
+    Override("openWall", amount=0.6),
+    New(
+        "faceFill",
+        "Indirect light on head and shoulders, soft at the edge.",
+        receivers=("Geometry/Person",),
+        casters=("Geometry/Room", "Geometry/Rug", "Geometry/CoffeeTable", "Geometry/Sofa"),
+        parameters={"color": (2.1, 1.8, 1.5)},
+        receiver_sphere=(0.95, 1.58, -0.62, 0.18, 0.62),
+    ),
+)
 
 
 def build(folder: Path) -> None:

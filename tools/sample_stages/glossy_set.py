@@ -6,6 +6,7 @@ from pathlib import Path
 
 from . import images
 from .build import StageBuilder
+from .edits import New, Override
 from .shapes import box, lathe, quad
 
 NAME = "glossy_set"
@@ -13,6 +14,31 @@ FRAMES = None
 DOC = """A table-top set: a glossy cone, a glossy sphere and a diffuse box between a blue wall and a pale one. The lamp
 faces the blue wall, so what the things show on that side is light the wall sent on, diffuse on the box and as a
 blurred reflection on cone and sphere: the two lobes an edit of the wall's light has to reach together."""
+
+
+SEQUENCE_DOC = "The sequence: what the blue wall sends the things turns to orange, in both lobes."
+SEQUENCE = (
+    New(
+        "wallOrange",
+        "The blue wall's light on cone, sphere, box and ring turned to its complement.",
+        receivers=("Geometry/Things",),
+        casters=("Geometry/Set/BlueWall",),
+        operation="hsv",
+        parameters={"hue": 165.0, "value": 1.3},
+    ),
+)
+SHOT_DOC = "The shot: wallOrange at half, and more of the wall on the floor beside it."
+SHOT = (
+    Override("wallOrange", amount=0.5),
+    New(
+        "floorBlue",
+        "A pool of blue on the floor at the wall's foot.",
+        receivers=("Geometry/Set/Floor",),
+        casters=("Geometry/Set/BlueWall",),
+        parameters={"gain": 3.0},
+        receiver_sphere=(-1.6, 0.0, 0.2, 0.3, 1.4),
+    ),
+)
 
 
 def build(folder: Path) -> None:

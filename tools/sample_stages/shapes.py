@@ -134,7 +134,7 @@ def wall_with_hole(
 
 
 def staircase(n_steps: int, width: float, rise: float, run: float) -> Shape:
-    """Solid steps that climb towards -Z from z = 0, centred in x: treads, risers, and both sides in one column a step."""
+    """Solid steps that climb towards -Z from z = 0, centred in x: treads, risers, and the sides, a column a step."""
     x = width / 2
     points: list[tuple[float, float, float]] = []
     faces: list[list[int]] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .build import StageBuilder
+from .edits import New, Override
 from .figure import Looks, Pose, add_figure
 from .shapes import box, lathe, quad, staircase
 
@@ -13,6 +14,40 @@ FRAMES = None
 DOC = """A stair hall lit from one panel that faces the ceiling, so all light in the picture but the ceiling's is
 indirect. A large cylinder hangs between ceiling and stairs and lays a soft indirect shadow on the treads and
 the statue: a shadow that no light's settings can lighten, and that an edit can."""
+
+
+SEQUENCE_DOC = "The sequence: the cylinder's indirect shadow lightened on the statue."
+SEQUENCE = (
+    New(
+        "statueLift",
+        "More of the ceiling's light on the statue.",
+        receivers=("Geometry/Statue",),
+        casters=("Geometry/Hall/Ceiling",),
+        parameters={"color": (1.9, 1.85, 1.75)},
+    ),
+)
+SHOT_DOC = (
+    "The shot: statueLift held back, the treads under the cylinder lit from the ceiling, less terracotta on them."
+)
+SHOT = (
+    Override("statueLift", amount=0.7),
+    New(
+        "treadsClear",
+        "The soft shadow on the stairs under the cylinder, lightened where it is deepest.",
+        receivers=("Geometry/Stairs",),
+        casters=("Geometry/Hall/Ceiling",),
+        parameters={"gain": 1.8},
+        receiver_sphere=(-0.3, 0.4, -0.3, 0.5, 1.6),
+    ),
+    New(
+        "terracotta",
+        "Less colour from the left wall on the stairs.",
+        receivers=("Geometry/Stairs",),
+        casters=("Geometry/Hall/LeftWall",),
+        operation="hsv",
+        parameters={"saturation": 0.4},
+    ),
+)
 
 
 def build(folder: Path) -> None:
