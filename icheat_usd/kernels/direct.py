@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import parallel_kernel
 from icheat_usd.kernels.environment import F32, F64, Table
-from icheat_usd.kernels.lights import hit_analytic, mesh_pdf, sample_analytic, sample_mesh
+from icheat_usd.kernels.lights import hit_shape, light_shape, mesh_pdf, sample_mesh, sample_shape
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 
 I32 = NDArray[np.int32]
@@ -41,6 +41,9 @@ def fill_analytic(
     Rows of the outputs are point-major, `n_samples` each. `radiance` holds L / (pdf n_samples),
     times the shading cosine if `cosine`; zero below either horizon.
     """
+    kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
+    texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
+    red, green, blue = lights.radiance[light, 0], lights.radiance[light, 1], lights.radiance[light, 2]
     for i in prange(position.shape[0]):
         if instance[i] < 0:
             continue
@@ -50,8 +53,23 @@ def fill_analytic(
         nx, ny, nz = float(shading_normal[i, 0]), float(shading_normal[i, 1]), float(shading_normal[i, 2])
         for k in range(n_samples):
             u1, u2 = sobol_pair(k, sequence)
-            wx, wy, wz, t, p, r, g, b = sample_analytic(
-                lights, textures, tables, light, px, py, pz, nx, ny, nz, float(u1), float(u2)
+            wx, wy, wz, t, p, r, g, b = sample_shape(
+                kind,
+                m,
+                inverse,
+                size,
+                image,
+                texels,
+                rows_cdf,
+                columns_cdf,
+                px,
+                py,
+                pz,
+                nx,
+                ny,
+                nz,
+                float(u1),
+                float(u2),
             )
             if p <= 0.0:
                 continue
@@ -67,9 +85,9 @@ def fill_analytic(
             direction[row, 2] = wz
             distance[row] = t
             pdf[row] = p
-            radiance[row, 0] = r * weight * lights.radiance[light, 0]
-            radiance[row, 1] = g * weight * lights.radiance[light, 1]
-            radiance[row, 2] = b * weight * lights.radiance[light, 2]
+            radiance[row, 0] = r * weight * red
+            radiance[row, 1] = g * weight * green
+            radiance[row, 2] = b * weight * blue
 
 
 @parallel_kernel
@@ -97,6 +115,8 @@ def fill_mesh(
     `radiance` lacks the emission of the triangles, whose rows and places are in `emissive` (-1: no ray)
     and `barycentric`.
     """
+    begin, end = lights.triangle_begin[light], lights.triangle_begin[light + 1]
+    cdf, corners = tables.triangle_cdf, tables.triangle_corners
     for i in prange(position.shape[0]):
         if instance[i] < 0:
             continue
@@ -104,7 +124,7 @@ def fill_mesh(
         px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
         for k in range(n_samples):
             u1, u2 = sobol_pair(k, sequence)
-            e, b1, b2, lx, ly, lz, p = sample_mesh(lights, tables, light, px, py, pz, float(u1), float(u2))
+            e, b1, b2, lx, ly, lz, p = sample_mesh(cdf, corners, begin, end, px, py, pz, float(u1), float(u2))
             if p <= 0.0:
                 continue
             dx, dy, dz = lx - px, ly - py, lz - pz
@@ -170,12 +190,18 @@ def meet_analytic(
     radiance: F32,
 ) -> None:
     """Where rays from surface points meet a light that is no mesh; rows of those that miss stay zero."""
+    kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
+    texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
     for i in prange(position.shape[0]):
-        t, p, r, g, b = hit_analytic(
-            lights,
-            textures,
-            tables,
-            light,
+        t, p, r, g, b = hit_shape(
+            kind,
+            m,
+            inverse,
+            size,
+            image,
+            texels,
+            rows_cdf,
+            columns_cdf,
             float(position[i, 0]),
             float(position[i, 1]),
             float(position[i, 2]),

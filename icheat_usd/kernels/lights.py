@@ -1,7 +1,7 @@
 """Points and directions on light sources, and how probable they are.
 
 Every sampler answers for one receiving point with a unit direction, the distance to the
-light, the light's radiance towards the point and the probability per solid angle. Shapes are
+light, the probability per solid angle and the place on the light's image. Shapes are
 treated in their own space and carried to the world by the linear map M of `to_world`; a
 probability per solid angle p' there is ``p' |M d|^3 / |det M|`` in the world (d a unit
 direction, local), an area element of a surface with tangents a, b is scaled by |Ma x Mb|.
@@ -10,19 +10,20 @@ direction, local), an area element of a surface with tangents a, b is scaled by 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel
 from icheat_usd.kernels.environment import (
-    Array,
+    F32,
+    F64,
     Floats,
     Table,
     dome_image_pdf,
-    dome_lookup,
     image_bilinear,
+    latlong_coordinates,
     sample_dome_image,
     search_cdf,
 )
@@ -64,12 +65,34 @@ def _normalized(x: float, y: float, z: float) -> Floats:
 
 
 @kernel
-def _linear(m: Array, x: float, y: float, z: float) -> Floats:
-    """M (x, y, z) for the 3 x 3 part of `m`."""
+def world_frame(lights: Table, light: int) -> Floats:
+    """`to_world` in double precision as twelve scalars, row by row: they stay in registers, a row view would not."""
+    m = lights.to_world
     return (
-        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
-        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
-        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+        float(m[light, 0, 0]), float(m[light, 0, 1]), float(m[light, 0, 2]), float(m[light, 0, 3]),
+        float(m[light, 1, 0]), float(m[light, 1, 1]), float(m[light, 1, 2]), float(m[light, 1, 3]),
+        float(m[light, 2, 0]), float(m[light, 2, 1]), float(m[light, 2, 2]), float(m[light, 2, 3]),
+    )  # fmt: skip
+
+
+@kernel
+def local_frame(tables: Table, light: int) -> Floats:
+    """Inverse of the linear part of `to_world`, laid out as `world_frame`."""
+    m = tables.to_local
+    return (
+        m[light, 0, 0], m[light, 0, 1], m[light, 0, 2], 0.0,
+        m[light, 1, 0], m[light, 1, 1], m[light, 1, 2], 0.0,
+        m[light, 2, 0], m[light, 2, 1], m[light, 2, 2], 0.0,
+    )  # fmt: skip
+
+
+@kernel
+def _linear(m: Floats, x: float, y: float, z: float) -> Floats:
+    """M (x, y, z) for the 3 x 3 part of a frame."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z,
+        m[4] * x + m[5] * y + m[6] * z,
+        m[8] * x + m[9] * y + m[10] * z,
     )
 
 
@@ -104,16 +127,16 @@ def _to_solid_angle(pdf_world_area: float, distance: float, cosine: float) -> fl
 
 
 @kernel
-def _plane_axes(m: Array) -> Floats:
+def _plane_axes(m: Floats) -> Floats:
     """World tangents of a disk or rect, its unit normal on the emitting (-Z) side, and |Mx x My|."""
-    ax, ay, az = m[0, 0] * 1.0, m[1, 0] * 1.0, m[2, 0] * 1.0
-    bx, by, bz = m[0, 1] * 1.0, m[1, 1] * 1.0, m[2, 1] * 1.0
+    ax, ay, az = m[0], m[4], m[8]
+    bx, by, bz = m[1], m[5], m[9]
     cx, cy, cz = _cross(ax, ay, az, bx, by, bz)
     area = math.sqrt(_dot(cx, cy, cz, cx, cy, cz))
     if area == 0.0:
         return ax, ay, az, bx, by, bz, 0.0, 0.0, 0.0, 0.0
     # Mz decides the side, so that a mirrored light still shines where its own -Z went
-    side = 1.0 if _dot(cx, cy, cz, m[0, 2], m[1, 2], m[2, 2]) < 0.0 else -1.0
+    side = 1.0 if _dot(cx, cy, cz, m[2], m[6], m[10]) < 0.0 else -1.0
     return ax, ay, az, bx, by, bz, side * cx / area, side * cy / area, side * cz / area, area
 
 
@@ -170,33 +193,13 @@ def _sample_spherical_rectangle(
 
 
 @kernel
-def _rect_radiance(lights: Table, textures: Table, light: int, x: float, y: float) -> Floats:
-    """Image of a textured rect at (x, y) in [0, 1]^2 of its plane: upright for who looks at its lit side."""
-    texture = lights.texture[light]
-    if texture < 0:
-        return 1.0, 1.0, 1.0
-    return image_bilinear(
-        textures.texels,
-        textures.begin[texture],
-        textures.width[texture],
-        textures.height[texture],
-        1.0 - x,
-        1.0 - y,
-        False,
-    )
-
-
-@kernel
-def _rect_frame(lights: Table, light: int, px: float, py: float, pz: float) -> Floats:
+def _rect_frame(m: Floats, width: float, height: float, px: float, py: float, pz: float) -> Floats:
     """Edge lengths, corner (x0, y0) and depth of a rect seen from a point, constants of Urena, its solid angle.
 
     Depth 0: the point is behind or the rect has no area. Solid angle 0: to be sampled by area.
     """
-    m = lights.to_world[light]
     ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
-    width = float(lights.size[light, 0])
-    height = float(lights.size[light, 1])
-    qx, qy, qz = m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz
+    qx, qy, qz = m[3] - px, m[7] - py, m[11] - pz
     depth = -_dot(qx, qy, qz, nx, ny, nz)
     if scale * width * height == 0.0 or depth <= 0.0:
         return 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -217,59 +220,50 @@ def _rect_frame(lights: Table, light: int, px: float, py: float, pz: float) -> F
 
 @kernel
 def _sample_rect(
-    lights: Table, textures: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+    m: Floats, width: float, height: float, px: float, py: float, pz: float, u1: float, u2: float
 ) -> Floats:
-    ex, ey, x0, y0, depth, b0, b1, k, solid_angle = _rect_frame(lights, light, px, py, pz)
+    ex, ey, x0, y0, depth, b0, b1, k, solid_angle = _rect_frame(m, width, height, px, py, pz)
     if depth <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     x = u1
     y = u2
     if solid_angle > 0.0:
         xu, yv = _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, -depth, x0 + ex, y0 + ey, u1, u2)
         x = (xu - x0) / ex
         y = (yv - y0) / ey
-    m = lights.to_world[light]
-    sx = (x - 0.5) * lights.size[light, 0]
-    sy = (y - 0.5) * lights.size[light, 1]
-    dx = m[0, 3] - px + m[0, 0] * sx + m[0, 1] * sy
-    dy = m[1, 3] - py + m[1, 0] * sx + m[1, 1] * sy
-    dz = m[2, 3] - pz + m[2, 0] * sx + m[2, 1] * sy
+    sx = (x - 0.5) * width
+    sy = (y - 0.5) * height
+    dx = m[3] - px + m[0] * sx + m[1] * sy
+    dy = m[7] - py + m[4] * sx + m[5] * sy
+    dz = m[11] - pz + m[8] * sx + m[9] * sy
     distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
-    pdf = 1.0 / solid_angle if solid_angle > 0.0 else _plane_pdf(lights, light, distance, depth / distance)
-    r, g, b = _rect_radiance(lights, textures, light, x, y)
-    return dx / distance, dy / distance, dz / distance, distance, pdf, r, g, b
+    pdf = (
+        1.0 / solid_angle
+        if solid_angle > 0.0
+        else _to_solid_angle(1.0 / (_plane_axes(m)[9] * width * height), distance, depth / distance)
+    )
+    return dx / distance, dy / distance, dz / distance, distance, pdf, x, y
 
 
 @kernel
-def _plane_pdf(lights: Table, light: int, distance: float, cosine: float) -> float:
-    """Probability per solid angle of uniform samples of the area of a rect or disk."""
-    scale = _plane_axes(lights.to_world[light])[9]
-    a = float(lights.size[light, 0])
-    area = scale * (a * lights.size[light, 1] if lights.kind[light] == _RECT else math.pi * a * a)
-    return _to_solid_angle(1.0 / area, distance, cosine)
-
-
-@kernel
-def _sample_disk(lights: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float) -> Floats:
-    m = lights.to_world[light]
+def _sample_disk(m: Floats, radius: float, px: float, py: float, pz: float, u1: float, u2: float) -> Floats:
     ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
-    radius = float(lights.size[light, 0])
     area = scale * math.pi * radius * radius
-    qx, qy, qz = m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz
+    qx, qy, qz = m[3] - px, m[7] - py, m[11] - pz
     depth = -_dot(qx, qy, qz, nx, ny, nz)
     if area == 0.0 or depth <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     x, y = _unit_disk(u1, u2)
     x *= radius
     y *= radius
     dx, dy, dz = qx + ax * x + bx * y, qy + ay * x + by * y, qz + az * x + bz * y
     distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
-    pdf = _plane_pdf(lights, light, distance, depth / distance)
-    return dx / distance, dy / distance, dz / distance, distance, pdf, 1.0, 1.0, 1.0
+    pdf = _to_solid_angle(1.0 / area, distance, depth / distance)
+    return dx / distance, dy / distance, dz / distance, distance, pdf, 0.0, 0.0
 
 
 @kernel
-def _direction_scale(m: Array, determinant: float, x: float, y: float, z: float) -> float:
+def _direction_scale(m: Floats, determinant: float, x: float, y: float, z: float) -> float:
     """World solid angle pdf over local one, for the unit local direction (x, y, z)."""
     wx, wy, wz = _linear(m, x, y, z)
     length = math.sqrt(_dot(wx, wy, wz, wx, wy, wz))
@@ -278,19 +272,16 @@ def _direction_scale(m: Array, determinant: float, x: float, y: float, z: float)
 
 @kernel
 def _sample_sphere(
-    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+    m: Floats, inverse: Floats, determinant: float, radius: float, px: float, py: float, pz: float, u1: float, u2: float
 ) -> Floats:
     """Cone that the sphere fills, in the space where it is the unit sphere; emits outwards only."""
-    m = lights.to_world[light]
-    radius = float(lights.size[light, 0])
-    determinant = tables.determinant[light]
     if radius <= 0.0 or determinant == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    qx, qy, qz = _linear(tables.to_local[light], m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz)
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    qx, qy, qz = _linear(inverse, m[3] - px, m[7] - py, m[11] - pz)
     qx, qy, qz = qx / radius, qy / radius, qz / radius
     d2 = _dot(qx, qy, qz, qx, qy, qz)
     if d2 <= 1.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     d = math.sqrt(d2)
     zx, zy, zz = qx / d, qy / d, qz / d
     one_minus_cos = (1.0 / d2) / (1.0 + math.sqrt(1.0 - 1.0 / d2))
@@ -310,53 +301,57 @@ def _sample_sphere(
     wx, wy, wz = _linear(m, dx * radius * t, dy * radius * t, dz * radius * t)
     distance = math.sqrt(_dot(wx, wy, wz, wx, wy, wz))
     if distance == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    return wx / distance, wy / distance, wz / distance, distance, pdf, 1.0, 1.0, 1.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    return wx / distance, wy / distance, wz / distance, distance, pdf, 0.0, 0.0
 
 
 @kernel
 def _sample_cylinder(
-    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+    m: Floats,
+    inverse: Floats,
+    determinant: float,
+    radius: float,
+    length: float,
+    px: float,
+    py: float,
+    pz: float,
+    u1: float,
+    u2: float,
 ) -> Floats:
     """Lateral surface about X, the part of it that faces the point; no caps, emits outwards only."""
-    m = lights.to_world[light]
-    radius = float(lights.size[light, 0])
-    length = float(lights.size[light, 1])
-    if radius <= 0.0 or length <= 0.0 or tables.determinant[light] == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    ox, oy, oz = px - m[0, 3], py - m[1, 3], pz - m[2, 3]
-    lx, ly, lz = _linear(tables.to_local[light], ox, oy, oz)
+    if radius <= 0.0 or length <= 0.0 or determinant == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    ox, oy, oz = px - m[3], py - m[7], pz - m[11]
+    lx, ly, lz = _linear(inverse, ox, oy, oz)
     rho = math.sqrt(ly * ly + lz * lz)
     if rho <= radius:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     half = math.acos(radius / rho)  # beyond it the tangent plane hides the point, in any affine picture
     phi = math.atan2(lz, ly) + half * (2.0 * u2 - 1.0)
     c = math.cos(phi)
     s = math.sin(phi)
     wx, wy, wz = _linear(m, (u1 - 0.5) * length, radius * c, radius * s)
-    ax, ay, az = m[0, 0] * 1.0, m[1, 0] * 1.0, m[2, 0] * 1.0
+    ax, ay, az = m[0], m[4], m[8]
     bx, by, bz = _linear(m, 0.0, -radius * s, radius * c)
     nx, ny, nz = _cross(ax, ay, az, bx, by, bz)
     jacobian = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
     dx, dy, dz = wx - ox, wy - oy, wz - oz
     distance = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
     if jacobian == 0.0 or distance == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     cosine = abs(_dot(nx, ny, nz, dx, dy, dz)) / (jacobian * distance)
     if cosine < 1e-9:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     pdf = _to_solid_angle(1.0 / (2.0 * half * length * jacobian), distance, cosine)
-    return dx / distance, dy / distance, dz / distance, distance, pdf, 1.0, 1.0, 1.0
+    return dx / distance, dy / distance, dz / distance, distance, pdf, 0.0, 0.0
 
 
 @kernel
-def _sample_distant(lights: Table, light: int, u1: float, u2: float) -> Floats:
+def _sample_distant(m: Floats, angle: float, u1: float, u2: float) -> Floats:
     """Cone about local +Z; a half-angle of zero is one direction whose `radiance` is an irradiance (pdf 1)."""
-    m = lights.to_world[light]
-    zx, zy, zz = _normalized(m[0, 2] * 1.0, m[1, 2] * 1.0, m[2, 2] * 1.0)
-    angle = float(lights.size[light, 0])
+    zx, zy, zz = _normalized(m[2], m[6], m[10])
     if angle <= 0.0:
-        return zx, zy, zz, _FAR, 1.0, 1.0, 1.0, 1.0
+        return zx, zy, zz, _FAR, 1.0, 0.0, 0.0
     half_sine = math.sin(0.5 * angle)
     one_minus_cos = 2.0 * half_sine * half_sine
     c = u1 * one_minus_cos
@@ -372,96 +367,101 @@ def _sample_distant(lights: Table, light: int, u1: float, u2: float) -> Floats:
         a * sz + b * tz + w * zz,
         _FAR,
         1.0 / (2.0 * math.pi * one_minus_cos),
-        1.0,
-        1.0,
-        1.0,
+        0.0,
+        0.0,
     )
 
 
 @kernel
-def _sample_dome(
-    lights: Table, textures: Table, tables: Table, light: int, nx: float, ny: float, nz: float, u1: float, u2: float
-) -> Floats:
-    """Textured: in proportion to the image. Untextured: cosine about the normal (nx, ny, nz)."""
+def _sample_plain_dome(nx: float, ny: float, nz: float, u1: float, u2: float) -> Floats:
+    x, y = _unit_disk(u1, u2)
+    z = math.sqrt(max(0.0, 1.0 - x * x - y * y))
+    sx, sy, sz, tx, ty, tz = orthonormal_basis(nx, ny, nz)
+    return (
+        x * sx + y * tx + z * nx,
+        x * sy + y * ty + z * ny,
+        x * sz + y * tz + z * nz,
+        _FAR,
+        z / math.pi,
+        0.0,
+        0.0,
+    )
+
+
+@kernel
+def light_shape(lights: Table, textures: Table, tables: Table, light: int) -> tuple[int, Floats, Floats, Floats, Any]:
+    """Kind, world and local frame, (|det|, sizes), and where the image and its distributions begin; all scalars.
+
+    Handing whole tables from one function to another costs more than most samplers do.
+    """
     texture = lights.texture[light]
-    if texture < 0:
-        x, y = _unit_disk(u1, u2)
-        z = math.sqrt(max(0.0, 1.0 - x * x - y * y))
-        sx, sy, sz, tx, ty, tz = orthonormal_basis(nx, ny, nz)
-        return (
-            x * sx + y * tx + z * nx,
-            x * sy + y * ty + z * ny,
-            x * sz + y * tz + z * nz,
-            _FAR,
-            z / math.pi,
-            1.0,
-            1.0,
-            1.0,
+    image = (-1, 0, 0, 0, 0)
+    if texture >= 0:
+        image = (
+            int(textures.begin[texture]),
+            int(textures.width[texture]),
+            int(textures.height[texture]),
+            int(tables.rows_begin[light]),
+            int(tables.columns_begin[light]),
         )
-    if tables.determinant[light] == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    x, y, z, pdf = sample_dome_image(
-        tables.rows_cdf,
-        tables.rows_begin[light],
-        tables.columns_cdf,
-        tables.columns_begin[light],
-        textures.width[texture],
-        textures.height[texture],
-        u1,
-        u2,
-    )
-    if pdf <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    r, g, b = dome_lookup(textures, texture, x, y, z)
-    m = lights.to_world[light]
-    pdf *= _direction_scale(m, tables.determinant[light], x, y, z)
-    wx, wy, wz = _linear(m, x, y, z)
-    wx, wy, wz = _normalized(wx, wy, wz)
-    return wx, wy, wz, _FAR, pdf, r, g, b
+    size = (float(tables.determinant[light]), float(lights.size[light, 0]), float(lights.size[light, 1]))
+    return int(lights.kind[light]), world_frame(lights, light), local_frame(tables, light), size, image
 
 
 @kernel
-def sample_analytic(
-    lights: Table,
-    textures: Table,
-    tables: Table,
-    light: int,
-    px: float,
-    py: float,
-    pz: float,
-    nx: float,
-    ny: float,
-    nz: float,
-    u1: float,
-    u2: float,
-) -> Floats:
+def sample_shape(
+    kind: int, m: Floats, inverse: Floats, size: Floats, image: Any, texels: F32, rows_cdf: F64, columns_cdf: F32,
+    px: float, py: float, pz: float, nx: float, ny: float, nz: float, u1: float, u2: float,
+) -> Floats:  # fmt: skip
     """Direction to the light (3), distance, pdf per solid angle, radiance (3), for every kind but MESH.
 
     Radiance is relative to `lights.radiance`. pdf 0 means that the light does not reach the point.
+    Domes with an image are sampled in proportion to it, others by the cosine about the normal.
     """
-    kind = lights.kind[light]
+    determinant, a, b = size
+    if kind == _DOME and image[0] >= 0:
+        begin, width, height, rows_begin, columns_begin = image
+        x, y, z, pdf = sample_dome_image(rows_cdf, rows_begin, columns_cdf, columns_begin, width, height, u1, u2)
+        if pdf <= 0.0 or determinant == 0.0:
+            return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        s, t = latlong_coordinates(x, y, z)
+        red, green, blue = image_bilinear(texels, begin, width, height, s, t, True)
+        pdf *= _direction_scale(m, determinant, x, y, z)
+        wx, wy, wz = _linear(m, x, y, z)
+        wx, wy, wz = _normalized(wx, wy, wz)
+        return wx, wy, wz, _FAR, pdf, red, green, blue
     if kind == _SPHERE:
-        return _sample_sphere(lights, tables, light, px, py, pz, u1, u2)
-    if kind == _DISK:
-        return _sample_disk(lights, light, px, py, pz, u1, u2)
-    if kind == _RECT:
-        return _sample_rect(lights, textures, light, px, py, pz, u1, u2)
-    if kind == _CYLINDER:
-        return _sample_cylinder(lights, tables, light, px, py, pz, u1, u2)
-    if kind == _DISTANT:
-        return _sample_distant(lights, light, u1, u2)
-    return _sample_dome(lights, textures, tables, light, nx, ny, nz, u1, u2)
+        wx, wy, wz, distance, pdf, x, y = _sample_sphere(m, inverse, determinant, a, px, py, pz, u1, u2)
+    elif kind == _DISK:
+        wx, wy, wz, distance, pdf, x, y = _sample_disk(m, a, px, py, pz, u1, u2)
+    elif kind == _RECT:
+        wx, wy, wz, distance, pdf, x, y = _sample_rect(m, a, b, px, py, pz, u1, u2)
+    elif kind == _CYLINDER:
+        wx, wy, wz, distance, pdf, x, y = _sample_cylinder(m, inverse, determinant, a, b, px, py, pz, u1, u2)
+    elif kind == _DISTANT:
+        wx, wy, wz, distance, pdf, x, y = _sample_distant(m, a, u1, u2)
+    else:
+        wx, wy, wz, distance, pdf, x, y = _sample_plain_dome(nx, ny, nz, u1, u2)
+    if kind != _RECT or image[0] < 0 or pdf <= 0.0:
+        return wx, wy, wz, distance, pdf, 1.0, 1.0, 1.0
+    red, green, blue = _rect_image(texels, image, x, y)
+    return wx, wy, wz, distance, pdf, red, green, blue
+
+
+@kernel
+def _rect_image(texels: F32, image: Any, x: float, y: float) -> Floats:
+    """Image at (x, y) in [0, 1]^2 of a rect's plane: upright for who looks at its lit side."""
+    return image_bilinear(texels, image[0], image[1], image[2], 1.0 - x, 1.0 - y, False)
 
 
 @kernel
 def sample_mesh(
-    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, u1: float, u2: float
+    cdf: F64, triangle_corners: F64, begin: int, end: int, px: float, py: float, pz: float, u1: float, u2: float
 ) -> Floats:
     """Row of the emissive tables, barycentric (2), point (3), pdf per solid angle."""
-    begin = lights.triangle_begin[light]
-    row = search_cdf(tables.triangle_cdf, begin, lights.triangle_begin[light + 1], u1)
-    below = tables.triangle_cdf[row - 1] if row > begin else 0.0
-    probability = tables.triangle_cdf[row] - below
+    row = search_cdf(cdf, begin, end, u1)
+    below = cdf[row - 1] if row > begin else 0.0
+    probability = cdf[row] - below
     if probability <= 0.0:
         return row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     v1 = min(max((u1 - below) / probability, 0.0), 1.0)
@@ -472,7 +472,7 @@ def sample_mesh(
     else:
         b2 = 0.5 * u2
         b1 = v1 - b2
-    p = tables.triangle_corners[row]
+    p = triangle_corners[row]
     ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
     bx, by, bz = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
     nx, ny, nz = _cross(ax, ay, az, bx, by, bz)
@@ -493,20 +493,19 @@ def sample_mesh(
 
 # Where rays meet lights ---------------------------------------------------------------------------
 # Each answers (distance, probability per solid angle with which the sampler above returns this
-# direction, radiance relative to `lights.radiance`); probability 0 where the ray misses.
+# direction, place on the image (2)); probability 0 where the ray misses.
 
 
 @kernel
 def _hit_plane(
-    lights: Table, textures: Table, light: int, px: float, py: float, pz: float, wx: float, wy: float, wz: float
+    kind: int, m: Floats, a: float, b: float, px: float, py: float, pz: float, wx: float, wy: float, wz: float
 ) -> Floats:
-    m = lights.to_world[light]
     ax, ay, az, bx, by, bz, nx, ny, nz, scale = _plane_axes(m)
     cosine = -_dot(wx, wy, wz, nx, ny, nz)
-    qx, qy, qz = m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz
+    qx, qy, qz = m[3] - px, m[7] - py, m[11] - pz
     depth = -_dot(qx, qy, qz, nx, ny, nz)
     if scale == 0.0 or cosine <= 0.0 or depth <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     t = depth / cosine
     hx, hy, hz = t * wx - qx, t * wy - qy, t * wz - qz
     aa = _dot(ax, ay, az, ax, ay, az)
@@ -516,140 +515,138 @@ def _hit_plane(
     hb = _dot(hx, hy, hz, bx, by, bz)
     x = (ha * bb - hb * ab) / (scale * scale)
     y = (hb * aa - ha * ab) / (scale * scale)
-    width = float(lights.size[light, 0])
-    if lights.kind[light] == _DISK:
-        if x * x + y * y > width * width:
-            return 0.0, 0.0, 0.0, 0.0, 0.0
-        return t, _plane_pdf(lights, light, t, cosine), 1.0, 1.0, 1.0
-    height = float(lights.size[light, 1])
-    if abs(x) > 0.5 * width or abs(y) > 0.5 * height:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    solid_angle = _rect_frame(lights, light, px, py, pz)[8]
-    pdf = 1.0 / solid_angle if solid_angle > 0.0 else _plane_pdf(lights, light, t, cosine)
-    r, g, b = _rect_radiance(lights, textures, light, x / width + 0.5, y / height + 0.5)
-    return t, pdf, r, g, b
+    if kind == _DISK:
+        if x * x + y * y > a * a:
+            return 0.0, 0.0, 0.0, 0.0
+        return t, _to_solid_angle(1.0 / (scale * math.pi * a * a), t, cosine), 0.0, 0.0
+    if abs(x) > 0.5 * a or abs(y) > 0.5 * b:
+        return 0.0, 0.0, 0.0, 0.0
+    solid_angle = _rect_frame(m, a, b, px, py, pz)[8]
+    pdf = 1.0 / solid_angle if solid_angle > 0.0 else _to_solid_angle(1.0 / (scale * a * b), t, cosine)
+    return t, pdf, x / a + 0.5, y / b + 0.5
 
 
 @kernel
 def _hit_sphere(
-    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, wx: float, wy: float, wz: float
+    m: Floats,
+    inverse: Floats,
+    determinant: float,
+    radius: float,
+    px: float,
+    py: float,
+    pz: float,
+    wx: float,
+    wy: float,
+    wz: float,
 ) -> Floats:
-    m = lights.to_world[light]
-    radius = float(lights.size[light, 0])
-    determinant = tables.determinant[light]
     if radius <= 0.0 or determinant == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    qx, qy, qz = _linear(tables.to_local[light], m[0, 3] - px, m[1, 3] - py, m[2, 3] - pz)
+        return 0.0, 0.0, 0.0, 0.0
+    qx, qy, qz = _linear(inverse, m[3] - px, m[7] - py, m[11] - pz)
     qx, qy, qz = qx / radius, qy / radius, qz / radius
-    dx, dy, dz = _linear(tables.to_local[light], wx, wy, wz)
+    dx, dy, dz = _linear(inverse, wx, wy, wz)
     length = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
     dx, dy, dz = dx / length, dy / length, dz / length
     d2 = _dot(qx, qy, qz, qx, qy, qz)
     along = _dot(qx, qy, qz, dx, dy, dz)
     if d2 <= 1.0 or along <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     # distance of the centre from the ray, by the cross product: d2 - along^2 would cancel from afar
     cx, cy, cz = _cross(qx, qy, qz, dx, dy, dz)
     inside = 1.0 - _dot(cx, cy, cz, cx, cy, cz)
     if inside < 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     t = (along - math.sqrt(inside)) * radius / length
     one_minus_cos = (1.0 / d2) / (1.0 + math.sqrt(1.0 - 1.0 / d2))
     pdf = _direction_scale(m, determinant, dx, dy, dz) / (2.0 * math.pi * one_minus_cos)
-    return t, pdf, 1.0, 1.0, 1.0
+    return t, pdf, 0.0, 0.0
 
 
 @kernel
 def _hit_cylinder(
-    lights: Table, tables: Table, light: int, px: float, py: float, pz: float, wx: float, wy: float, wz: float
+    m: Floats,
+    inverse: Floats,
+    determinant: float,
+    radius: float,
+    length: float,
+    px: float,
+    py: float,
+    pz: float,
+    wx: float,
+    wy: float,
+    wz: float,
 ) -> Floats:
-    m = lights.to_world[light]
-    radius = float(lights.size[light, 0])
-    length = float(lights.size[light, 1])
-    if radius <= 0.0 or length <= 0.0 or tables.determinant[light] == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    lx, ly, lz = _linear(tables.to_local[light], px - m[0, 3], py - m[1, 3], pz - m[2, 3])
-    dx, dy, dz = _linear(tables.to_local[light], wx, wy, wz)
+    if radius <= 0.0 or length <= 0.0 or determinant == 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    lx, ly, lz = _linear(inverse, px - m[3], py - m[7], pz - m[11])
+    dx, dy, dz = _linear(inverse, wx, wy, wz)
     rho = math.sqrt(ly * ly + lz * lz)
     a = dy * dy + dz * dz
     b = -(ly * dy + lz * dz)
     if rho <= radius or a == 0.0 or b <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     offset = ly * dz - lz * dy
     root = a * radius * radius - offset * offset
     if root < 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     t = (b - math.sqrt(root)) / a
     if t <= 0.0 or abs(lx + t * dx) > 0.5 * length:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     y = ly + t * dy
     z = lz + t * dz
     # tangents along the axis and around it (per radian)
     bx, by, bz = _linear(m, 0.0, -z, y)
-    nx, ny, nz = _cross(m[0, 0] * 1.0, m[1, 0] * 1.0, m[2, 0] * 1.0, bx, by, bz)
+    nx, ny, nz = _cross(m[0], m[4], m[8], bx, by, bz)
     jacobian = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
     cosine = abs(_dot(nx, ny, nz, wx, wy, wz)) / jacobian
     if cosine < 1e-9:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     half = math.acos(radius / rho)
-    return t, _to_solid_angle(1.0 / (2.0 * half * length * jacobian), t, cosine), 1.0, 1.0, 1.0
+    return t, _to_solid_angle(1.0 / (2.0 * half * length * jacobian), t, cosine), 0.0, 0.0
 
 
 @kernel
-def _hit_distant(lights: Table, light: int, wx: float, wy: float, wz: float) -> Floats:
-    m = lights.to_world[light]
-    zx, zy, zz = _normalized(m[0, 2] * 1.0, m[1, 2] * 1.0, m[2, 2] * 1.0)
-    half_sine = math.sin(0.5 * lights.size[light, 0])
+def _hit_distant(m: Floats, angle: float, wx: float, wy: float, wz: float) -> Floats:
+    zx, zy, zz = _normalized(m[2], m[6], m[10])
+    half_sine = math.sin(0.5 * angle)
     chord2 = (wx - zx) * (wx - zx) + (wy - zy) * (wy - zy) + (wz - zz) * (wz - zz)
     if half_sine <= 0.0 or chord2 > 4.0 * half_sine * half_sine:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    return _FAR, 1.0 / (4.0 * math.pi * half_sine * half_sine), 1.0, 1.0, 1.0
+        return 0.0, 0.0, 0.0, 0.0
+    return _FAR, 1.0 / (4.0 * math.pi * half_sine * half_sine), 0.0, 0.0
 
 
 @kernel
-def _hit_dome(
-    lights: Table, textures: Table, tables: Table, light: int,
-    nx: float, ny: float, nz: float, wx: float, wy: float, wz: float,
+def hit_shape(
+    kind: int, m: Floats, inverse: Floats, size: Floats, image: Any, texels: F32, rows_cdf: F64, columns_cdf: F32,
+    px: float, py: float, pz: float, nx: float, ny: float, nz: float, wx: float, wy: float, wz: float,
 ) -> Floats:  # fmt: skip
-    texture = lights.texture[light]
-    if texture < 0:
+    """Where a ray from a point meets a light that is no mesh: distance, pdf of `sample_shape`, radiance (3)."""
+    determinant, a, b = size
+    if kind == _DOME and image[0] < 0:
         return _FAR, max(0.0, _dot(nx, ny, nz, wx, wy, wz)) / math.pi, 1.0, 1.0, 1.0
-    if tables.determinant[light] == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    x, y, z = _linear(tables.to_local[light], wx, wy, wz)
-    x, y, z = _normalized(x, y, z)
-    pdf = dome_image_pdf(
-        tables.rows_cdf,
-        tables.rows_begin[light],
-        tables.columns_cdf,
-        tables.columns_begin[light],
-        textures.width[texture],
-        textures.height[texture],
-        x,
-        y,
-        z,
-    )
-    r, g, b = dome_lookup(textures, texture, x, y, z)
-    pdf *= _direction_scale(lights.to_world[light], tables.determinant[light], x, y, z)
-    return _FAR, pdf, r, g, b
-
-
-@kernel
-def hit_analytic(
-    lights: Table, textures: Table, tables: Table, light: int, px: float, py: float, pz: float,
-    nx: float, ny: float, nz: float, wx: float, wy: float, wz: float,
-) -> Floats:  # fmt: skip
-    """Where a ray from a point meets a light that is no mesh, as `sample_analytic` would have sampled it."""
-    kind = lights.kind[light]
+    if kind == _DOME:
+        if determinant == 0.0:
+            return 0.0, 0.0, 0.0, 0.0, 0.0
+        begin, width, height, rows_begin, columns_begin = image
+        x, y, z = _linear(inverse, wx, wy, wz)
+        x, y, z = _normalized(x, y, z)
+        pdf = dome_image_pdf(rows_cdf, rows_begin, columns_cdf, columns_begin, width, height, x, y, z)
+        s, t = latlong_coordinates(x, y, z)
+        red, green, blue = image_bilinear(texels, begin, width, height, s, t, True)
+        return _FAR, pdf * _direction_scale(m, determinant, x, y, z), red, green, blue
     if kind == _SPHERE:
-        return _hit_sphere(lights, tables, light, px, py, pz, wx, wy, wz)
-    if kind == _DISK or kind == _RECT:
-        return _hit_plane(lights, textures, light, px, py, pz, wx, wy, wz)
-    if kind == _CYLINDER:
-        return _hit_cylinder(lights, tables, light, px, py, pz, wx, wy, wz)
-    if kind == _DISTANT:
-        return _hit_distant(lights, light, wx, wy, wz)
-    return _hit_dome(lights, textures, tables, light, nx, ny, nz, wx, wy, wz)
+        distance, pdf, x, y = _hit_sphere(m, inverse, determinant, a, px, py, pz, wx, wy, wz)
+    elif kind == _CYLINDER:
+        distance, pdf, x, y = _hit_cylinder(m, inverse, determinant, a, b, px, py, pz, wx, wy, wz)
+    elif kind == _DISTANT:
+        distance, pdf, x, y = _hit_distant(m, a, wx, wy, wz)
+    else:
+        distance, pdf, x, y = _hit_plane(kind, m, a, b, px, py, pz, wx, wy, wz)
+    if pdf <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    if kind != _RECT or image[0] < 0:
+        return distance, pdf, 1.0, 1.0, 1.0
+    red, green, blue = _rect_image(texels, image, x, y)
+    return distance, pdf, red, green, blue
 
 
 @kernel

@@ -378,7 +378,8 @@ def _shadow_rays(
 
 
 def _visibility(snapshot: SceneSnapshot, tracer: Tracer, chunk: SurfacePoints, rays: _ShadowRays) -> F32:
-    start = spawn_points(snapshot, take_points(chunk, rays.point), rays.direction)
+    # every ray leaves above the geometric normal, so one origin per point serves
+    start = spawn_points(snapshot, chunk, chunk.normal)[rays.point]
     if rays.end is None:
         return transmittance(snapshot, tracer, start, rays.direction, rays.distance * _STOP_SHORT)
     # both ends stand on geometry: offset the far one as well, or a mesh light shadows itself

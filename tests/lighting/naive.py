@@ -71,7 +71,7 @@ def surface_irradiance(
     to_world: ArrayLike,
     point: ArrayLike,
     normal: ArrayLike,
-    n: int = 512,
+    n: int = 320,
 ) -> float:
     """Midpoint quadrature over a surface of radiance 1 that emits along its outward normal.
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import OpenEXR
 import pytest
 
 from icheat_usd.kernels.environment import dome_image_pdf, sample_dome_image
 from icheat_usd.lighting import build_light_sampler, environment_radiance, environment_radiance_per_light
 from icheat_usd.scene import LightKind
-from tests.scenes import Image, Light, Mesh, make_snapshot, quad, rotation, translation
+from tests.scenes import Image, Light, Mesh, make_snapshot, quad, rotation, scaling, translation
 
 WIDTH, HEIGHT = 16, 8
 
@@ -117,3 +120,42 @@ def test_every_direction_that_shines_can_be_drawn() -> None:
     pdf = np.array([dome_image_pdf(*tables, *(float(x) for x in row)) for row in directions])
     assert shines.sum() > 50
     assert (pdf[shines] > 0).all()
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    channels = OpenEXR.File(str(path)).channels()
+    together = channels.get("RGB") or channels.get("RGBA")
+    if together is not None:
+        return together.pixels[..., :3]
+    return np.stack([channels[name].pixels for name in "RGB"], -1)
+
+
+def test_the_sky_behind_the_windows_of_an_outside_renderers_picture_is_where_it_is(shared_scenes: Path) -> None:
+    """The living room's published picture (Tungsten) shows its sky: found only if image and frame face right."""
+    folder = shared_scenes / "bitterli_living-room"
+    sky = read_rgb(folder / "textures" / "Sky_19.exr")
+    picture = read_rgb(folder / "reference_TungstenRender.exr")
+    # rows of the stage's matrices, as USD writes them
+    dome_rows = np.array(((0, 0, -1), (0, 1, 0), (1, 0, 0)))
+    camera_rows = np.array(
+        (
+            (-0.26420911, 0.0, -0.96446542),
+            (0.07176300, 0.99722796, -0.01965900),
+            (0.96179207, -0.07440701, -0.26347603),
+        )
+    )
+    h, w = picture.shape[:2]
+    x = (np.arange(w) + 0.5) / w * 2 - 1  # focal length is half the aperture
+    y = (1 - (np.arange(h) + 0.5) / h * 2) * h / w
+    rays = np.stack(np.broadcast_arrays(x[None], y[:, None], -1.0), -1).reshape(-1, 3) @ camera_rows
+
+    def share_seen(rows: np.ndarray) -> float:
+        to_world = np.eye(4)
+        to_world[:3, :3] = rows.T
+        snapshot = make_snapshot([Mesh(quad())], lights=[dome(sky, to_world)])
+        image = environment_radiance(snapshot, rays.astype(np.float32)).reshape(h, w, 3)
+        return float((np.abs(image - picture) < 0.05 * image).all(-1).mean())
+
+    assert share_seen(dome_rows) > 0.05
+    for wrong in (scaling(-1, 1, 1), scaling(1, 1, -1), rotation((0, 1, 0), 180), rotation((0, 1, 0), 90)):
+        assert share_seen(wrong[:3, :3] @ dome_rows) < 0.01

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from icheat_usd.kernels.direct import meet_analytic
-from icheat_usd.kernels.lights import sample_analytic, sample_mesh
+from icheat_usd.kernels.lights import light_shape, sample_mesh, sample_shape
 from icheat_usd.lighting import build_light_sampler, environment_radiance, irradiance, reflected_direct
 from icheat_usd.materials import evaluate
 from icheat_usd.scene import LightKind, SceneSnapshot, SurfacePoints
@@ -128,15 +128,11 @@ ANALYTIC = [
 def test_rays_meet_lights_where_and_as_probably_as_they_are_sampled(light: Light) -> None:
     snapshot = scene(light)
     tables = build_light_sampler(snapshot).tables
-    rng = np.random.default_rng(0)
-    rows = np.array(
-        [
-            sample_analytic(
-                snapshot.lights, snapshot.textures, tables, 0, 0.1, 0.0, -0.1, 0.0, 1.0, 0.0, *rng.random(2)
-            )
-            for _ in range(500)
-        ]
-    )
+    place = (0.1, 0.0, -0.1, *UP)
+    shape = light_shape(snapshot.lights, snapshot.textures, tables, 0)
+    distributions = snapshot.textures.texels, tables.rows_cdf, tables.columns_cdf
+    numbers = np.random.default_rng(0).random((500, 2))
+    rows = np.array([sample_shape(*shape, *distributions, *place, *u) for u in numbers])
     assert (rows[:, 4] > 0).all()
     n = len(rows)
     at = np.tile(np.float32((0.1, 0.0, -0.1)), (n, 1))
@@ -208,6 +204,6 @@ def test_mesh_samples_stay_on_their_triangles() -> None:
     snapshot = scene(meshes=(lamp(1.0, transform=POSES["sheared"]),))
     tables = build_light_sampler(snapshot).tables
     for u in np.random.default_rng(0).random((200, 2)):
-        row, b1, b2, *_ = sample_mesh(snapshot.lights, tables, 0, 0.0, 0.0, 0.0, *u)
+        row, b1, b2, *_ = sample_mesh(tables.triangle_cdf, tables.triangle_corners, 0, 2, 0.0, 0.0, 0.0, *u)
         assert row in (0, 1)
         assert b1 >= 0 and b2 >= 0 and b1 + b2 <= 1 + 1e-12
