@@ -33,20 +33,22 @@ def create_stack(stage: Any, path: str | None, *, layer: str, camera: str | None
     EditError
         The stage has no default prim to put it under, or the layer refuses.
     """
-    if path is None:
-        default = stage.GetDefaultPrim()
-        if not default:
-            name = stage.GetRootLayer().identifier
-            raise EditError(f"{name} has no default prim to hold the edit stack; set defaultPrim, or name the stack")
-        path = f"{default.GetPath()}/Edits"
-    stack = authoring.create_stack(stage, path, layer=layer, camera=camera)
+    stack = authoring.create_stack(stage, path or _default_stack(stage), layer=layer, camera=camera)
     _save(stage, layer)
     return stack
 
 
+def _default_stack(stage: Any) -> str:
+    default = stage.GetDefaultPrim()
+    if not default:
+        name = stage.GetRootLayer().identifier
+        raise EditError(f"{name} has no default prim to hold the edit stack; set defaultPrim, or name the stack")
+    return f"{default.GetPath()}/Edits"
+
+
 def add_edit(
     stage: Any,
-    stack: str,
+    stack: str | None,
     name: str,
     *,
     layer: str,
@@ -68,6 +70,8 @@ def add_edit(
 
     Parameters
     ----------
+    stack : str or None
+        None makes one, ``<default prim>/Edits``.
     sidecar : path, optional
         Folder or file for the payload; beside the layer's file by default. Needed for layers without a file.
 
@@ -79,12 +83,13 @@ def add_edit(
     """
     parameters = parameters or {}
     target = authoring.find_layer(stage, layer)
+    stack_path = stack or _default_stack(stage)
     payload = Payload(
         operation=operation,
         parameters=dict(parameters),
         receiver_mask=receiver_mask,
         caster_mask=caster_mask,
-        scale_delta=_baked(operation, parameters, f"{stack}/{name}"),
+        scale_delta=_baked(operation, parameters, f"{stack_path}/{name}"),
         made_against=made_against or {},
     )
     beside = sidecar or target.realPath
@@ -95,23 +100,26 @@ def add_edit(
     elif receiver_mask is not None or caster_mask is not None:
         raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
     try:
-        path = authoring.add_edit(
-            stage,
-            stack,
-            name,
-            layer=target,
-            operation=operation,
-            parameters=parameters,
-            receivers=receivers,
-            casters=casters,
-            amount=amount,
-            blend=blend,
-            payload=written,
-            time=frame,
-            before=before,
-            after=after,
-        )
-        _save(stage, layer)
+        with authoring.writing(stage, target, stack_path):
+            if stack is None:
+                authoring.create_stack(stage, stack_path, layer=target)
+            path = authoring.add_edit(
+                stage,
+                stack_path,
+                name,
+                layer=target,
+                operation=operation,
+                parameters=parameters,
+                receivers=receivers,
+                casters=casters,
+                amount=amount,
+                blend=blend,
+                payload=written,
+                time=frame,
+                before=before,
+                after=after,
+            )
+            _save(stage, layer)
     except BaseException:
         if written is not None:
             written[0].unlink(missing_ok=True)

@@ -271,10 +271,9 @@ class Session:
         EditError, SidecarError
             Something named does not exist or cannot be written; the layer is then as before.
         """
-        stack = self.stack_path or authoring.create_stack(self.stage, None, layer=layer, camera=self.camera)
         return authoring.add_edit(
             self.stage,
-            stack,
+            self.stack_path,
             name,
             layer=layer,
             operation=operation,

@@ -149,13 +149,14 @@ def _first_line(error: Tf.ErrorException) -> str:
 
 
 @contextmanager
-def _writing(stage: Usd.Stage, layer: str | Sdf.Layer, path: Sdf.Path) -> Iterator[Sdf.Layer]:
+def writing(stage: Usd.Stage, layer: str | Sdf.Layer, path: str | Sdf.Path) -> Iterator[Sdf.Layer]:
     """Write opinions at or below `path` to a layer, times mapped into it.
 
     USD's refusals become errors; after any error the layer says what it said before.
     """
     schema.require_registered()
     target = find_layer(stage, layer)
+    path = Sdf.Path(path)
     before = Sdf.Layer.CreateAnonymous()
     existed = bool(target.GetPrimAtPath(path))
     if existed:
@@ -221,7 +222,7 @@ def create_stack(stage: Usd.Stage, path: str, *, layer: str | Sdf.Layer, camera:
     if schema.has_schema(existing, schema.STACK_API):
         raise EditError(f"{stack_path} is a stack already; add edits to it or choose another path")
     cameras = collections.find_prims(stage, [camera], "camera") if camera is not None else ()
-    with _writing(stage, layer, stack_path):
+    with writing(stage, layer, stack_path):
         for ancestor in stack_path.GetPrefixes()[:-1]:
             if not stage.GetPrimAtPath(ancestor) or not stage.GetPrimAtPath(ancestor).IsDefined():
                 stage.DefinePrim(ancestor, "Scope")
@@ -285,7 +286,7 @@ def add_edit(
     if stage.GetPrimAtPath(path):
         raise EditError(f"{path} exists already; choose another name or set its values")
     _refuse_instances(stage, path)
-    with _writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath()) as target:
         edit = stage.DefinePrim(path, "Scope")
         _apply(edit, schema.EDIT_API)
         _set_operation(edit, operation, parameters or {}, time, has_payload=payload is not None)
@@ -335,7 +336,7 @@ def move_edit(
         An edit is not in the stack, or a stronger layer decides the order.
     """
     prim = stack_prim(stage, stack)
-    with _writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath()) as target:
         _move(prim, _listed(prim, edit), target, before=before, after=after)
 
 
@@ -351,7 +352,7 @@ def remove_edit(stage: Usd.Stage, stack: str, edit: str, *, layer: str | Sdf.Lay
     """
     prim = stack_prim(stage, stack)
     path = _listed(prim, edit)
-    with _writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath()) as target:
         relationship = _relationship(prim, schema.EDITS)
         relationship.RemoveTarget(path)
         if path in relationship.GetTargets():
@@ -448,7 +449,7 @@ def set_edit(
     prim = _writable_edit(stage, edit)
     written: list[str] = []
     selections: list[EditFinding] = []
-    with _writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath()) as target:
         if operation is not None or parameters:
             token = operation or str(schema.read_attribute(prim, schema.OPERATION, time))
             has_payload = strongest_opinion(prim.GetAttribute(schema.PAYLOAD)) is not None
@@ -659,7 +660,7 @@ def set_payload_key(
     if interpolation not in (None, "linear", "held"):
         raise EditError(f"{edit}: no key interpolation is called '{interpolation}'; there are linear, held")
     prim = _writable_edit(stage, edit)
-    with _writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath()) as target:
         if time is None:
             _clear_keys(prim, target)
         else:
