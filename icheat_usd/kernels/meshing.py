@@ -1,12 +1,15 @@
-"""Loops over faces and corners of polygon meshes: edges, Catmull-Clark steps, normals, triangles."""
+"""Loops over faces and corners of polygon meshes: edges, Catmull-Clark steps, normals, triangles.
+
+Serial: a stage has many small meshes, for which waking threads costs more than
+the work, and large ones are bound by memory.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels._jit import kernel
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -176,7 +179,7 @@ def split_vertices(
                 out[v, k] = (faces + 2.0 * edges + (valence[v] - 3.0) * vertices[v, k]) / valence[v]
 
 
-@parallel_kernel
+@kernel
 def split_corners(
     starts: I64, indices: I64, of_corner: I64, n_vertices: int, n_edges: int, corners: F64, quads: I64, out: F64
 ) -> None:
@@ -191,7 +194,7 @@ def split_corners(
     out : (n_corners, 4, m) out
     """
     width = corners.shape[1]
-    for f in prange(len(starts) - 1):
+    for f in range(len(starts) - 1):
         first, last = starts[f], starts[f + 1]
         for c in range(first, last):
             ahead = c + 1 if c + 1 < last else first
@@ -268,7 +271,7 @@ def vertex_normals(vertices: F64, starts: I64, indices: I64, out: F64) -> None:
             out[v, 2] += ax * by - ay * bx
 
 
-@parallel_kernel
+@kernel
 def find_reflex(points: F64, starts: I64, indices: I64, reflex: I64) -> None:
     """The first corner of each polygon that turns the wrong way, counted from its first corner; -1 where none does.
 
@@ -276,7 +279,7 @@ def find_reflex(points: F64, starts: I64, indices: I64, reflex: I64) -> None:
     ----------
     reflex : (n_polygons,) out
     """
-    for f in prange(len(starts) - 1):
+    for f in range(len(starts) - 1):
         reflex[f] = -1
         first, last = starts[f], starts[f + 1]
         if last - first < 4:
@@ -303,7 +306,7 @@ def find_reflex(points: F64, starts: I64, indices: I64, reflex: I64) -> None:
                 break
 
 
-@parallel_kernel
+@kernel
 def measure_triangles(positions: F64, vertex: I64, thinnest: float, flat: F64, good: U8) -> None:
     """Unit normals of triangles, and which of them have an area.
 
@@ -316,7 +319,7 @@ def measure_triangles(positions: F64, vertex: I64, thinnest: float, flat: F64, g
     flat : (n, 3) out
     good : (n,) out
     """
-    for t in prange(len(vertex)):
+    for t in range(len(vertex)):
         a, b, c = positions[vertex[t, 0]], positions[vertex[t, 1]], positions[vertex[t, 2]]
         ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
         vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
@@ -332,7 +335,7 @@ def measure_triangles(positions: F64, vertex: I64, thinnest: float, flat: F64, g
             flat[t] = 0.0
 
 
-@parallel_kernel
+@kernel
 def unit_normals(values: F64, rows: I64, flat: F64, out: F32) -> None:
     """Unit normals per corner; the triangle's own where a value has no length.
 
@@ -345,7 +348,7 @@ def unit_normals(values: F64, rows: I64, flat: F64, out: F32) -> None:
         Normals of the triangles.
     out : (n, 3, 3) out
     """
-    for t in prange(len(rows)):
+    for t in range(len(rows)):
         for k in range(3):
             v = values[rows[t, k]]
             length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
@@ -353,10 +356,10 @@ def unit_normals(values: F64, rows: I64, flat: F64, out: F32) -> None:
                 out[t, k, axis] = v[axis] / length if length > 1e-30 else flat[t, axis]
 
 
-@parallel_kernel
+@kernel
 def take(values: F64, begin: int, rows: I64, out: F32) -> None:
     """``out[t, k, j] = values[rows[t, k], begin + j]``, converted on the way."""
-    for t in prange(len(rows)):
+    for t in range(len(rows)):
         for k in range(rows.shape[1]):
             for j in range(out.shape[2]):
                 out[t, k, j] = values[rows[t, k], begin + j]

@@ -19,8 +19,18 @@ AROUND = 48  #: faces around the axis
 ALONG_SPHERE = 24  #: rings from pole to pole
 ALONG_CAP = 12  #: rings of a capsule's hemisphere
 
+_ATTRIBUTES = {
+    "Sphere": ("radius",),
+    "Cube": ("size",),
+    "Cylinder": ("radius", "height", "axis"),
+    "Cylinder_1": ("radiusTop", "radiusBottom", "height", "axis"),
+    "Cone": ("radius", "height", "axis"),
+    "Capsule": ("radius", "height", "axis"),
+    "Capsule_1": ("radiusTop", "radiusBottom", "height", "axis"),
+    "Plane": ("width", "length", "axis"),
+}
 #: Types this module turns into triangles.
-TYPES = ("Sphere", "Cube", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane")
+TYPES = tuple(_ATTRIBUTES)
 
 #: points, counts, indices, normals per corner, st per corner
 Shape = tuple[F64, I64, I64, F64, F64]
@@ -30,11 +40,10 @@ _AXES = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}
 
 def parameters(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[object, ...]:
     """Everything that shapes an implicit prim at a time: equal parameters, equal triangles."""
-    names = ("size", "radius", "height", "radiusTop", "radiusBottom", "width", "length", "axis")
-    values: list[object] = [str(prim.GetTypeName())]
-    for name in names:
-        attribute = prim.GetAttribute(name)
-        values.append(attribute.Get(time) if attribute else None)
+    kind = str(prim.GetTypeName())
+    values: list[object] = [kind]
+    for name in ("size", "radius", "height", "radiusTop", "radiusBottom", "width", "length", "axis"):
+        values.append(prim.GetAttribute(name).Get(time) if name in _ATTRIBUTES[kind] else None)
     gprim = UsdGeom.Gprim(prim)
     values.append(bool(gprim.GetDoubleSidedAttr().Get(time)))
     values.append(str(gprim.GetOrientationAttr().Get(time)))

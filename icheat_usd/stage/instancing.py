@@ -53,7 +53,8 @@ class InstancerReader:
         path = str(prim.GetPath())
         for placed in self._expand(prim, 0):
             names = [(path, int(instance_id), placed.part) for instance_id in placed.ids]
-            self._builder.place(placed.mesh, placed.matrices @ to_world, names)
+            meshes = np.full(len(names), placed.mesh, np.int64)
+            self._builder.place(meshes, placed.matrices @ to_world, names)
 
     def _expand(self, prim: Usd.Prim, depth: int) -> list[_Placed]:
         instancer = UsdGeom.PointInstancer(prim)

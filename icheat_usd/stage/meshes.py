@@ -267,8 +267,11 @@ def _read_control_mesh(
     elif scheme not in ("none", "catmullClark", "bilinear"):
         report(prim, "subdivisionScheme", f"'{scheme}' is no subdivision scheme; the mesh is taken as polygons.")
         scheme = "none"
+    boundary = str(mesh.GetInterpolateBoundaryAttr().Get(time))
     if scheme == "catmullClark":
         _report_creases(mesh, time, report)
+        if boundary == "none":
+            report(prim, "interpolateBoundary none", "faces at the boundary are kept, as with edgeAndCorner.")
     refined = scheme in ("catmullClark", "bilinear")
 
     sizes = Topology(len(points), counts, indices)
@@ -287,7 +290,7 @@ def _read_control_mesh(
         indices=indices,
         scheme=scheme,
         level=_affordable_level(len(indices), level, prim, report) if refined else 0,
-        sharp_corners=str(mesh.GetInterpolateBoundaryAttr().Get(time)) != "edgeOnly",
+        sharp_corners=boundary != "edgeOnly",
         left_handed=str(mesh.GetOrientationAttr().Get(time)) == "leftHanded",
         double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
         shown=_shown_faces(mesh, time, len(counts), report),

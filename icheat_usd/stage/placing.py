@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
-from icheat_usd.scene import F64, Geometry, Surface
+from icheat_usd.scene import F64, I64, Geometry, Surface
 from icheat_usd.stage import implicit
 from icheat_usd.stage.materials import MaterialLibrary
 from icheat_usd.stage.meshes import FaceMaterials, TriangleMesh, read_mesh
@@ -149,40 +149,43 @@ class GeometryBuilder:
 
     # Placements ----------------------------------------------------------
 
-    def place_prim(self, prim: Usd.Prim, mesh: int) -> None:
-        """One surface: a gprim where it stands."""
-        matrix = np.array(self.xforms.GetLocalToWorldTransform(prim))
-        self.place(mesh, matrix[None], [(str(prim.GetPath()), -1, "")])
+    def place_prims(self, prims: Sequence[Usd.Prim], meshes: Sequence[int | None]) -> None:
+        """One surface for each gprim that has a mesh, where it stands."""
+        placed = [(prim, mesh) for prim, mesh in zip(prims, meshes, strict=True) if mesh is not None]
+        if not placed:
+            return
+        matrices = np.array([self.xforms.GetLocalToWorldTransform(prim) for prim, _ in placed], dtype=np.float64)
+        names = [(str(prim.GetPath()), -1, "") for prim, _ in placed]
+        self.place(np.array([mesh for _, mesh in placed]), matrices, names)
 
-    def place(self, mesh: int, matrices: F64, names: Sequence[tuple[str, int, str]]) -> None:
-        """Several surfaces of one mesh.
+    def place(self, meshes: I64, matrices: F64, names: Sequence[tuple[str, int, str]]) -> None:
+        """Add one surface per row.
 
         Parameters
         ----------
-        mesh
-            Row of the mesh.
+        meshes : (k,) int64
+            Rows of the meshes.
         matrices : (k, 4, 4) float64
             Row-vector local-to-world matrices in stage units.
         names : k of (path, id, part)
         """
         finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
-        if not finite.all():
-            self.report(names[int(np.argmin(finite))][0], "transform", "a transform is not finite; left out there.")
+        for i in np.flatnonzero(~finite).tolist():
+            self.report(names[i][0], "transform", "a transform is not finite; left out there.")
         # Scaled to nothing is a usual way to hide; it has no area.
         kept = finite & (np.abs(np.where(finite[:, None, None], matrices, 0.0)[:, :3, :3]).max(axis=(1, 2)) > 0.0)
         if not kept.any():
             return
+        meshes = meshes[kept]
         transforms = np.transpose(matrices[kept], (0, 2, 1))[:, :3, :].copy()
-        source = self.meshes[mesh]
-        transforms[:, :, 3] += transforms[:, :, :3] @ source.origin
-        self._instance_mesh.append(np.full(len(transforms), mesh))
+        origins = np.array([mesh.origin for mesh in self.meshes])
+        transforms[:, :, 3] += np.einsum("nij,nj->ni", transforms[:, :, :3], origins[meshes])
+        self._instance_mesh.append(meshes)
         self._transforms.append(transforms)
-        faces, digest = source.n_faces, source.topology_digest
-        self.surfaces.extend(
-            Surface(path, instance_id, part, faces, digest)
-            for (path, instance_id, part), keep in zip(names, kept, strict=True)
-            if keep
-        )
+        kept_names = [name for name, keep in zip(names, kept.tolist(), strict=True) if keep]
+        for (path, instance_id, part), mesh in zip(kept_names, meshes.tolist(), strict=True):
+            source = self.meshes[mesh]
+            self.surfaces.append(Surface(path, instance_id, part, source.n_faces, source.topology_digest))
 
     def bounds(self) -> tuple[F64, F64] | None:
         """Box around everything placed, stage units; None where nothing is."""

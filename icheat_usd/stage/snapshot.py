@@ -82,9 +82,7 @@ def take_snapshot(
         builder = GeometryBuilder(when, materials, subdivision_level, purposes, choices.material_purpose, report)
         gprims = [prim for prim in found.gprims if builder.is_shown(prim)]
         progress("reading the stage", 0.2)
-        for prim, mesh in zip(gprims, builder.add_meshes(gprims), strict=True):
-            if mesh is not None:
-                builder.place_prim(prim, mesh)
+        builder.place_prims(gprims, builder.add_meshes(gprims))
         progress("reading the stage", 0.6)
         instancers = InstancerReader(builder)
         for prim in found.instancers:

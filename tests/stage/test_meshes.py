@@ -60,7 +60,7 @@ def test_a_quad_keeps_its_winding_its_parametrisation_and_a_flat_normal() -> Non
         [[0, 0, 0], [1, 1, 0], [0, 1, 0]],
     ]
     assert np.array_equal(mesh.face_uv, mesh.points[..., :2])
-    assert np.array_equal(mesh.normals, np.broadcast_to(np.float32([0, 0, 1]), (2, 3, 3)))
+    assert np.array_equal(mesh.normals, np.broadcast_to(np.array([0, 0, 1], np.float32), (2, 3, 3)))
     assert mesh.face.tolist() == [0, 0] and mesh.n_faces == 1
     assert np.all(mesh.color == np.float32(DEFAULT_COLOR))
     for array in (mesh.points, mesh.normals, mesh.st, mesh.color, mesh.face_uv):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from icheat_usd.stage.subdivision import Cage, refine
 CUBE_FACES = [(0, 1, 5, 4), (1, 3, 7, 5), (3, 2, 6, 7), (2, 0, 4, 6), (4, 5, 7, 6), (1, 0, 2, 3)]
 
 
-def cage(points: np.ndarray, faces: list[tuple[int, ...]], corners: np.ndarray | None = None) -> Cage:
+def cage(points: np.ndarray, faces: Sequence[tuple[int, ...]], corners: np.ndarray | None = None) -> Cage:
     counts = np.array([len(face) for face in faces], np.int64)
     indices = np.array([i for face in faces for i in face], np.int64)
     if corners is None:
