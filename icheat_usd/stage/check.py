@@ -67,10 +67,11 @@ def check_stage(
     Parameters
     ----------
     time
-        Time code at which values are read; keys and time samples are all looked at.
+        Time code at which values are read, by default the stage's start; keys and samples are all looked at.
     read_payload
         Given one, every payload is read.
     """
+    time = schema.default_time(stage, time)
     with quiet_usd():  # USD warns on stderr about dropped targets, each time it composes them.
         everything = list(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
         stacks = tuple(prim for prim in everything if schema.has_schema(prim, schema.STACK_API))

@@ -72,7 +72,8 @@ def find_stack(stage: Usd.Stage, stack: str | None = None, camera: str | None = 
     stack
         Path of the stack, absolute or relative to the default prim; or the name of a stack, if only one has it.
     camera
-        Path of the camera that is rendered. A stack that names no camera is for any camera, after those that do.
+        Path of the camera that is rendered; anything that is no path counts as no camera. A stack that names no
+        camera is for any camera, after those that do.
 
     Returns
     -------
@@ -92,6 +93,8 @@ def find_stack(stage: Usd.Stage, stack: str | None = None, camera: str | None = 
     targets = {str(prim.GetPath()): _targets(prim, schema.CAMERA) for prim in stack_prims(stage)}
     if not targets:
         return None
+    if camera is not None and not camera.startswith("/"):
+        camera = None
     candidates = [path for path, cameras in targets.items() if camera is not None and camera in cameras]
     candidates = candidates or [path for path, cameras in targets.items() if camera is None or not cameras]
     if len(candidates) == 1:
@@ -188,7 +191,7 @@ def read_edit_stack(
     Parameters
     ----------
     time
-        Time code; None reads at the earliest time.
+        Time code; None reads at the stage's authored start, else at the earliest time.
     surface_paths
         Scene paths of all surfaces, which the edits' collections select from.
     read_payload
@@ -207,6 +210,7 @@ def read_edit_stack(
     SidecarError
         A payload's file is missing, or `read_payload` refuses it.
     """
+    time = schema.default_time(stage, time)
     prim = stack_prim(stage, stack_path)
     prims, findings = listed_edits(prim)
     paths = frozenset(surface_paths)
@@ -471,6 +475,7 @@ def describe_edit(stage: Usd.Stage, path: str, time: float | None = None) -> Edi
     EditError
         There is no edit at `path`.
     """
+    time = schema.default_time(stage, time)
     prim = stage.GetPrimAtPath(path)
     if not prim or (prim.IsActive() and not schema.has_schema(prim, schema.EDIT_API)):
         prim = edit_prim(stage, path)

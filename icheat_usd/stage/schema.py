@@ -66,6 +66,13 @@ def time_code(time: float | None) -> Usd.TimeCode:
     return Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
 
 
+def default_time(stage: Usd.Stage, time: float | None) -> float | None:
+    """`time`, else the stage's authored start, as for snapshots; None where it has neither."""
+    if time is None and stage.HasAuthoredMetadata("startTimeCode"):
+        return float(stage.GetStartTimeCode())
+    return time
+
+
 @cache
 def packaged_schemas() -> MappingProxyType[str, MappingProxyType[str, PropertySchema]]:
     """Properties of each schema in generatedSchema.usda, read as data: schema name to property name."""

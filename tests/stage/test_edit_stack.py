@@ -116,6 +116,9 @@ def test_values_are_read_at_the_time_asked_for(stage: Usd.Stage) -> None:
         set_edit(stage, path, layer="seq.usda", amount=amount, time=time)
     amounts = [read_edit_stack(stage, STACK, t, SURFACES)[0].edits[0].amount for t in (None, 102, 107, 122, 999)]
     assert amounts == [0.0, 0.0, 0.25, 1.0, 1.0]
+    stage.GetRootLayer().startTimeCode = 107  # what a snapshot without a time is taken at, too
+    assert read_edit_stack(stage, STACK, None, SURFACES)[0].edits[0].amount == 0.25
+    assert describe_edit(stage, path).amount.value == 0.25
 
 
 # --------------------------------------------------------------------------- selection
@@ -337,6 +340,8 @@ def test_a_camera_finds_its_own_stack_before_one_for_any_camera(stage: Usd.Stage
     create_stack(stage, "for_camera", layer="shot.usda", camera="camera")
     assert find_stack(stage, camera="/World/camera") == "/World/for_camera"
     assert find_stack(stage, camera="/World/other_camera") == STACK
+    with pytest.raises(EditError, match="2 of the stacks"):
+        find_stack(stage, camera="auto")
     create_stack(stage, "again", layer="shot.usda", camera="camera")
     with pytest.raises(EditError, match="2 of the stacks"):
         find_stack(stage, camera="/World/camera")
