@@ -18,6 +18,7 @@ from tests.scenes import (
     Material,
     Mesh,
     TextureUse,
+    closed_box,
     make_snapshot,
     quad,
     quads,
@@ -339,3 +340,14 @@ def test_power_is_area_times_pi_times_radiance() -> None:
     assert power[1, 0] == pytest.approx(np.pi * 4 * np.pi, rel=1e-4)
     assert power[2, 0] == pytest.approx(np.pi * 2 * np.pi * 1 * 3, rel=1e-4)
     assert power[3, 0] == pytest.approx(2 * np.pi * 6 * 0.7, rel=1e-5)
+
+
+def test_inside_a_closed_shining_box_every_wall_receives_pi() -> None:
+    snapshot = closed_box(0.5, 1.0)
+    across = np.random.default_rng(0).uniform(-0.8, 0.8, (64, 3))
+    for axis in range(3):
+        at, normal = across.copy(), np.zeros(3)
+        at[:, axis], normal[axis] = -1.0, 1.0
+        result = irradiance_at(snapshot, naive.receivers(at, normal), n_samples=2048)[0, :, 0]
+        np.testing.assert_allclose(result, np.pi, rtol=0.1)
+        assert result.mean() == pytest.approx(np.pi, rel=5e-3)

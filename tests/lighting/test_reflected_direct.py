@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -207,3 +208,27 @@ def test_mesh_samples_stay_on_their_triangles() -> None:
         row, b1, b2, *_ = sample_mesh(tables.triangle_cdf, tables.triangle_corners, 0, 2, 0.0, 0.0, 0.0, *u)
         assert row in (0, 1)
         assert b1 >= 0 and b2 >= 0 and b1 + b2 <= 1 + 1e-12
+
+
+def test_reflected_light_has_the_same_bits_for_any_number_of_threads_and_any_chunk(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    snapshot = scene(
+        *ANALYTIC[:3],
+        Light(LightKind.DOME, 1.0),
+        meshes=(lamp(1.0, transform=POSES["overhead"]), Mesh(quad(0.5, y=0.5))),
+    )
+    points = glossy(0.3, 150)
+    points.position[:, 0] = np.linspace(-1, 1, 150)
+    points.specular_edge[::3] = 0.0
+    before = numba.get_num_threads()
+    together = reflected_at(snapshot, points, n_samples=8)
+    try:
+        numba.set_num_threads(1)
+        alone = reflected_at(snapshot, points, n_samples=8)
+    finally:
+        numba.set_num_threads(before)
+    monkeypatch.setattr("icheat_usd.lighting.direct._RAYS", 64)
+    pieces = reflected_at(snapshot, points, n_samples=8)
+    np.testing.assert_array_equal(alone, together)
+    np.testing.assert_array_equal(pieces, together)
