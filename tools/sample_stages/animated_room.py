@@ -15,7 +15,8 @@ NAME = "animated_room"
 FRAMES = (1, 48)
 DOC = """48 frames at 24 frames/s, camera fixed: a red ball bounces into a basket that slides to meet it while a person
 walks past the couch. Lights and room stand still; the light that ball, basket and person take from and
-send to the floor moves with them, so an edit on it has to be keyed."""
+send to the floor moves with them, so an edit on it has to be keyed.
+Expect at 160 x 120 in frame 28: mean luminance 0.392, 53 % indirect; shot.usda changes the indirect light by +1.2 %."""
 
 STEP = 3  # frames between samples; linear in between
 

@@ -15,7 +15,8 @@ FRAMES = None
 DOC = """A furnished room, 5.2 x 5 m. Sunlight through a window left of the picture falls on the rug and the low table.
 The person beside it stands in the shade, lit by what rug and floor send on: a lighter who wants the face warmer, or
 less red from the rug, has no light to turn.
-Variant set "sky" on /World: "rect" is a RectLight before the window, "dome" a textured sky that is seen through it."""
+Variant set "sky" on /World: "rect" is a RectLight before the window, "dome" a textured sky that is seen through it.
+Expect at 160 x 120: mean luminance 0.264, 45 % indirect; shot.usda changes the indirect light by +2.7 %."""
 
 
 SEQUENCE_DOC = "The sequence: the rug's red kept off the person, the back wall opened up."

@@ -13,7 +13,8 @@ NAME = "glossy_set"
 FRAMES = None
 DOC = """A table-top set: a glossy cone, a glossy sphere and a diffuse box between a blue wall and a pale one. The lamp
 faces the blue wall, so what the things show on that side is light the wall sent on, diffuse on the box and as a
-blurred reflection on cone and sphere: the two lobes an edit of the wall's light has to reach together."""
+blurred reflection on cone and sphere: the two lobes an edit of the wall's light has to reach together.
+Expect at 160 x 120: mean luminance 0.344, 30 % indirect; shot.usda changes the indirect light by +3.0 %."""
 
 
 SEQUENCE_DOC = "The sequence: what the blue wall sends the things turns to orange, in both lobes."

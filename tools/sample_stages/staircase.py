@@ -13,7 +13,8 @@ NAME = "staircase"
 FRAMES = None
 DOC = """A stair hall lit from one panel that faces the ceiling, so all light in the picture but the ceiling's is
 indirect. A large cylinder hangs between ceiling and stairs and lays a soft indirect shadow on the treads and
-the statue: a shadow that no light's settings can lighten, and that an edit can."""
+the statue: a shadow that no light's settings can lighten, and that an edit can.
+Expect at 160 x 120: mean luminance 0.352, 97 % indirect; shot.usda changes the indirect light by +6.3 %."""
 
 
 SEQUENCE_DOC = "The sequence: the cylinder's indirect shadow lightened on the statue."
