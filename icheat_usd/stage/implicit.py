@@ -43,7 +43,11 @@ def parameters(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[object, ...]:
     kind = str(prim.GetTypeName())
     values: list[object] = [kind]
     for name in ("size", "radius", "height", "radiusTop", "radiusBottom", "width", "length", "axis"):
-        values.append(prim.GetAttribute(name).Get(time) if name in _ATTRIBUTES[kind] else None)
+        value = prim.GetAttribute(name).Get(time) if name in _ATTRIBUTES[kind] else None
+        if name == "axis" or value is None:
+            values.append(None if value is None else str(value))
+        else:
+            values.append(float(value) if isinstance(value, int | float) else float("nan"))
     gprim = UsdGeom.Gprim(prim)
     values.append(bool(gprim.GetDoubleSidedAttr().Get(time)))
     values.append(str(gprim.GetOrientationAttr().Get(time)))
@@ -52,14 +56,22 @@ def parameters(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[object, ...]:
 
 def display_color(prim: Usd.Prim, time: Usd.TimeCode, report: Reporter) -> tuple[float, float, float]:
     """The one displayColor of an implicit prim."""
+    grey = (DEFAULT_COLOR, DEFAULT_COLOR, DEFAULT_COLOR)
     primvar = find_primvar(prim, "displayColor")
-    values = None if primvar is None else primvar.ComputeFlattened(time)
-    if not values:
-        return (DEFAULT_COLOR, DEFAULT_COLOR, DEFAULT_COLOR)
-    if len(values) > 1:
+    value = None if primvar is None else primvar.ComputeFlattened(time)
+    if value is None or not len(value):
+        return grey
+    try:
+        colors = np.array(value, dtype=np.float64).reshape(-1, 3)
+    except (TypeError, ValueError):
+        colors = np.full((1, 3), np.nan)
+    if not np.isfinite(colors).all():
+        report(prim, "primvar displayColor", "displayColor is not finite or no colour; ignored.")
+        return grey
+    if len(colors) > 1:
         kind = prim.GetTypeName()
-        report(prim, "primvar displayColor", f"a {kind} takes one displayColor; the first of {len(values)} is used.")
-    return (float(values[0][0]), float(values[0][1]), float(values[0][2]))
+        report(prim, "primvar displayColor", f"a {kind} takes one displayColor; the first of {len(colors)} is used.")
+    return (float(colors[0, 0]), float(colors[0, 1]), float(colors[0, 2]))
 
 
 def read_implicit(
@@ -113,7 +125,7 @@ def read_implicit(
 
 
 def _number(value: object) -> float:
-    return 0.0 if value is None else float(value)  # type: ignore[arg-type]
+    return float(value) if isinstance(value, int | float) else 0.0
 
 
 def _cube(size: float) -> Shape:

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Tf, Usd, UsdGeom
 
 from icheat_usd.scene import F64, I64
 from icheat_usd.stage.placing import GeometryBuilder, relative_matrix
 from icheat_usd.stage.walking import walk
-
-#: Instancers inside prototypes of instancers are followed this deep; a prototype may, by mistake, hold itself.
-DEEPEST = 8
 
 
 @dataclass(frozen=True)
@@ -42,6 +39,7 @@ class InstancerReader:
         self._builder = builder
         self._report = builder.report
         self._parts: dict[Sdf.Path, list[_Part]] = {}
+        self._open: set[Sdf.Path] = set()  # prototypes being read
 
     def place(self, prim: Usd.Prim) -> None:
         """Add every visible instance of an instancer that is itself shown.
@@ -51,12 +49,12 @@ class InstancerReader:
         """
         to_world = np.array(self._builder.xforms.GetLocalToWorldTransform(prim))
         path = str(prim.GetPath())
-        for placed in self._expand(prim, 0):
+        for placed in self._expand(prim):
             names = [(path, int(instance_id), placed.part) for instance_id in placed.ids]
             meshes = np.full(len(names), placed.mesh, np.int64)
             self._builder.place(meshes, placed.matrices @ to_world, names)
 
-    def _expand(self, prim: Usd.Prim, depth: int) -> list[_Placed]:
+    def _expand(self, prim: Usd.Prim) -> list[_Placed]:
         instancer = UsdGeom.PointInstancer(prim)
         time = self._instance_time(instancer)
         which = np.array(instancer.GetProtoIndicesAttr().Get(time) or (), dtype=np.int64)
@@ -85,7 +83,7 @@ class InstancerReader:
             if not prototype:
                 self._report(prim, "prototypes", f"prototype {index} does not exist; its instances are left out.")
                 continue
-            for part in self._prototype_parts(prototype, depth):
+            for part in self._prototype_parts(prototype):
                 result.append(_Placed(part.mesh, part.matrix @ matrices[chosen], ids[chosen], part.name))
         return result
 
@@ -110,9 +108,12 @@ class InstancerReader:
             if values and len(values) != n:
                 self._report(prim, name, f"{name} has {len(values)} values for {n} instances; ignored.")
         # With prototype transforms included USD gives up altogether where one index is wrong.
-        matrices = instancer.ComputeInstanceTransformsAtTime(
-            time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
-        )
+        try:
+            matrices = instancer.ComputeInstanceTransformsAtTime(
+                time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+            )
+        except Tf.ErrorException:
+            matrices = None
         if matrices is None or len(matrices) != n:
             self._report(prim, "point instancer", "USD finds no transforms for its instances; left out.")
             return None
@@ -140,10 +141,16 @@ class InstancerReader:
                 prim, "primvar displayColor", "a colour per instance is not supported; the prototype's colour is used."
             )
 
-    def _prototype_parts(self, root: Usd.Prim, depth: int) -> list[_Part]:
+    def _prototype_parts(self, root: Usd.Prim) -> list[_Part]:
         path = root.GetPath()
         if path in self._parts:
             return self._parts[path]
+        if path in self._open:
+            self._report(
+                root, "prototypes", "this prototype holds an instancer of itself; the inner instances are left out."
+            )
+            return []
+        self._open.add(path)
         builder = self._builder
         own, _ = builder.xforms.GetLocalTransformation(root)
         to_prototype = np.array(own)  # the instance's transform comes on top of the prototype's own
@@ -160,11 +167,8 @@ class InstancerReader:
         for nested in found.instancers:
             if not self._is_shown_within(nested, root):
                 continue
-            if depth + 1 >= DEEPEST:
-                self._report(nested, "nested point instancer", f"nested deeper than {DEEPEST}; left out.")
-                continue
             base, matrix = _relative_path(nested, root), relative_matrix(builder.xforms, nested, root) @ to_prototype
-            for placed in self._expand(nested, depth + 1):
+            for placed in self._expand(nested):
                 below = f"/{placed.part}" if placed.part else ""
                 parts.extend(
                     _Part(placed.mesh, placed.matrices[i] @ matrix, f"{base}[{placed.ids[i]}]{below}")
@@ -172,6 +176,7 @@ class InstancerReader:
                 )
         if len(parts) == 1:
             parts = [_Part(parts[0].mesh, parts[0].matrix, "")]
+        self._open.remove(path)
         self._parts[path] = parts
         return parts
 

@@ -302,9 +302,17 @@ def _read_control_mesh(
 
 def _read_topology(mesh: UsdGeom.Mesh, time: Usd.TimeCode, report: Reporter) -> tuple[F64, I64, I64] | None:
     prim = mesh.GetPrim()
-    points = np.array(mesh.GetPointsAttr().Get(time) or (), dtype=np.float64).reshape(-1, 3)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or (), dtype=np.int64)
-    indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or (), dtype=np.int64)
+    try:
+        points = np.array(mesh.GetPointsAttr().Get(time) or (), dtype=np.float64).reshape(-1, 3)
+        counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or (), dtype=np.int64).reshape(-1)
+        indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or (), dtype=np.int64).reshape(-1)
+    except (TypeError, ValueError):
+        report(
+            prim,
+            "mesh",
+            "points, faceVertexCounts or faceVertexIndices have another type than UsdGeomMesh's; left out.",
+        )
+        return None
     if not len(points) or not len(counts):
         report(prim, "mesh", "it has no points or no faces at this time; left out.")
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from icheat_usd.stage.implicit import AROUND, display_color, parameters, read_implicit
 from icheat_usd.stage.meshes import FaceMaterials, TriangleMesh
@@ -141,3 +141,24 @@ def test_a_shape_without_area_is_reported(radius: float) -> None:
     prim = sphere.GetPrim()
     assert read_implicit(parameters(prim, NOW), (1.0, 1.0, 1.0), FaceMaterials(0), prim, report) is None
     assert [(f.prim, f.feature) for f in report.findings()] == [("/s", "implicit shape")]
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "expected", "n_findings"),
+    [
+        ([(0.1, 0.2, 0.3)], "color3f[]", (0.1, 0.2, 0.3), 0),
+        ([(0.1, 0.2, 0.3), (1, 1, 1)], "color3f[]", (0.1, 0.2, 0.3), 1),
+        ([(float("nan"), 0, 0)], "color3f[]", (0.18, 0.18, 0.18), 1),
+        ([], "color3f[]", (0.18, 0.18, 0.18), 0),
+    ],
+)
+def test_display_color_is_one_colour_or_the_grey_fallback(
+    value: object, kind: str, expected: tuple[float, float, float], n_findings: int
+) -> None:
+    stage = Usd.Stage.CreateInMemory()
+    sphere = UsdGeom.Sphere.Define(stage, "/s")
+    primvars = UsdGeom.PrimvarsAPI(sphere)
+    primvars.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Find(kind), "vertex").Set(value)
+    report = Reporter()
+    assert display_color(sphere.GetPrim(), NOW, report) == pytest.approx(expected)
+    assert len(report.findings()) == n_findings

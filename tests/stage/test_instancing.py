@@ -270,3 +270,13 @@ def test_seventy_thousand_instances_take_a_moment_and_no_copies() -> None:
     assert snapshot.n_instances == n and len(snapshot.geometry.points) == 2
     assert np.allclose(snapshot.geometry.instance_to_world[:, :, 3] + snapshot.centre, positions, atol=1e-4)
     assert [s.instance_id for s in snapshot.surfaces] == list(range(n))
+
+
+def test_a_prototype_that_holds_its_own_instancer_does_not_recurse() -> None:
+    stage = stage_in_metres()
+    UsdGeom.Xform.Define(stage, "/group")
+    square(stage, "/group/plate")
+    instancer(stage, "/group/pi", ["/group"], [0] * 50)
+    snapshot = auto(stage)
+    assert [(f.prim, f.feature) for f in snapshot.findings] == [("/group", "prototypes")]
+    assert len(snapshot.surfaces) == 51

@@ -212,3 +212,53 @@ def test_the_same_stage_gives_the_same_bits() -> None:
 def test_a_negative_subdivision_level_is_refused(level: int) -> None:
     with pytest.raises(StageError, match="subdivision level"):
         take_snapshot(room(), subdivision_level=level)
+
+
+WRONG_TYPES = """#usda 1.0
+( metersPerUnit = 1 )
+def Mesh "points" {
+    float[] points = [1, 2]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+}
+def Mesh "strings" {
+    string[] points = ["a"]
+    string[] faceVertexCounts = ["b"]
+    int[] faceVertexIndices = [0]
+}
+def Mesh "values" {
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    string[] primvars:displayColor = ["red"]
+    float[] primvars:st = [1, 2, 3] ( interpolation = "vertex" )
+    normal3f[] primvars:normals = [(0, 0, 1)] ( interpolation = "somewhere" )
+    uniform token subdivisionScheme = "none"
+    uniform token orientation = "sideways"
+    int[] holeIndices = [-4, 9]
+}
+def PointInstancer "dots" {
+    int[] protoIndices = [0]
+    float[] positions = [0, 0, 0]
+}
+def Sphere "ball" {
+    string radius = "large"
+}
+"""
+
+
+def test_values_of_a_wrong_type_are_findings_and_never_tracebacks() -> None:
+    stage = Usd.Stage.CreateInMemory()
+    assert stage.GetRootLayer().ImportFromString(WRONG_TYPES)
+    snapshot = take_snapshot(stage, camera="auto")
+    assert [s.path for s in snapshot.surfaces] == ["/values"]
+    assert sorted((f.prim, f.feature) for f in snapshot.findings) == [
+        ("/ball", "implicit shape"),
+        ("/dots", "point instancer"),
+        ("/points", "mesh"),
+        ("/strings", "mesh"),
+        ("/values", "holeIndices"),
+        ("/values", "primvar displayColor"),
+        ("/values", "primvar normals"),
+        ("/values", "primvar st"),
+    ]
