@@ -57,6 +57,15 @@ def pack_rows(counts, begin, index, weight, out_index, out_weight):  # type: ign
 
 
 @parallel_kernel
+def place_rows(indptr, begin, index, weight, out_index, out_weight):  # type: ignore[no-untyped-def]
+    """Copy row r of a packed matrix to ``begin[r]`` of another."""
+    for r in prange(len(begin)):
+        for e in range(indptr[r + 1] - indptr[r]):
+            out_index[begin[r] + e] = index[indptr[r] + e]
+            out_weight[begin[r] + e] = weight[indptr[r] + e]
+
+
+@parallel_kernel
 def mean_over_segments(begin, values, out):  # type: ignore[no-untyped-def]
     """Mean of ``values[begin[i]:begin[i + 1]]`` (p, k) into ``out[i]`` (n, k); segments are not empty."""
     for i in prange(len(begin) - 1):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels._jit import parallel_kernel
 from icheat_usd.kernels.locate import nearest_sample
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 
@@ -83,36 +83,6 @@ def cells_of_hits(  # type: ignore[no-untyped-def]
             )
 
 
-@kernel
-def _sort(keys, values, n):  # type: ignore[no-untyped-def]
-    """Heap sort by key, then by value, so that the order of equal keys is settled too."""
-    for start in range(n // 2 - 1, -1, -1):
-        _sift(keys, values, start, n)
-    for end in range(n - 1, 0, -1):
-        keys[0], keys[end] = keys[end], keys[0]
-        values[0], values[end] = values[end], values[0]
-        _sift(keys, values, 0, end)
-
-
-@kernel
-def _sift(keys, values, start, end):  # type: ignore[no-untyped-def]
-    root = start
-    while True:
-        child = 2 * root + 1
-        if child >= end:
-            return
-        if child + 1 < end and (
-            keys[child] < keys[child + 1] or (keys[child] == keys[child + 1] and values[child] < values[child + 1])
-        ):
-            child += 1
-        if keys[root] < keys[child] or (keys[root] == keys[child] and values[root] < values[child]):
-            keys[root], keys[child] = keys[child], keys[root]
-            values[root], values[child] = values[child], values[root]
-            root = child
-        else:
-            return
-
-
 @parallel_kernel
 def merge_counts(cell, n_rays, counts, out_cell, out_weight):  # type: ignore[no-untyped-def]
     """Row r of the output: the distinct cells of its `n_rays` entries of `cell`, each with its share of rays."""
@@ -134,38 +104,43 @@ def merge_counts(cell, n_rays, counts, out_cell, out_weight):  # type: ignore[no
 
 
 @parallel_kernel
-def merge_weights(begin, cell, weight, counts, out_cell, out_weight):  # type: ignore[no-untyped-def]
-    """Row r of the output: cells of entries ``begin[r]:begin[r + 1]``, equal ones added; out of place, from `begin`.
+def merge_weights(n_rays, cell, weight, counts, out_cell, out_weight):  # type: ignore[no-untyped-def]
+    """Row r of the outputs: distinct cells of its `n_rays` entries, ascending, and their added weights (n, k).
 
-    Entries without a cell or a weight are dropped.
+    Entries without a cell, and cells without any weight, are dropped.
     """
+    n_columns = weight.shape[1]
     for r in prange(len(counts)):
-        n = begin[r + 1] - begin[r]
-        keys = cell[begin[r] : begin[r + 1]].copy()
-        values = weight[begin[r] : begin[r + 1]].copy()
-        _sort(keys, values, n)
+        first = r * n_rays
+        keys = cell[first : first + n_rays]
+        order = np.argsort(keys, kind="mergesort")
+        total = np.empty(n_columns, np.float64)
         count = 0
         e = 0
-        while e < n:
-            first = e
-            total = 0.0
-            while e < n and keys[e] == keys[first]:
-                total += values[e]
+        while e < n_rays:
+            key = keys[order[e]]
+            for c in range(n_columns):
+                total[c] = 0.0
+            while e < n_rays and keys[order[e]] == key:
+                for c in range(n_columns):
+                    total[c] += weight[first + order[e], c]
                 e += 1
-            if keys[first] >= 0 and total > 0.0:
-                out_cell[begin[r] + count] = keys[first]
-                out_weight[begin[r] + count] = total
+            if key >= 0 and total.max() > 0.0:
+                out_cell[first + count] = key
+                for c in range(n_columns):
+                    out_weight[first + count, c] = total[c]
                 count += 1
         counts[r] = count
 
 
 @parallel_kernel
-def pack_segments(begin, counts, packed_begin, cell, weight, out_cell, out_weight):  # type: ignore[no-untyped-def]
-    """Copy the first ``counts[r]`` entries from ``begin[r]`` to ``packed_begin[r]``."""
+def pack_weights(n_rays, counts, packed_begin, cell, weight, out_cell, out_weight):  # type: ignore[no-untyped-def]
+    """Copy the first ``counts[r]`` entries of each row to ``packed_begin[r]``; weights column by column."""
     for r in prange(len(counts)):
         for e in range(counts[r]):
-            out_cell[packed_begin[r] + e] = cell[begin[r] + e]
-            out_weight[packed_begin[r] + e] = weight[begin[r] + e]
+            out_cell[packed_begin[r] + e] = cell[r * n_rays + e]
+            for c in range(weight.shape[1]):
+                out_weight[c, packed_begin[r] + e] = weight[r * n_rays + e, c]
 
 
 @parallel_kernel

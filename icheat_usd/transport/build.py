@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from icheat_usd.transport.interpolate import sparse_rows_of_view
 from icheat_usd.transport.sparse import SparseRows, concatenate_rows
 
 _RAYS_AT_ONCE = 1 << 20
+_WEAK_SPECULAR = 0.2  # reflectance at normal incidence; dielectrics have 0.02 to 0.17
 _CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
 
 
@@ -113,12 +114,10 @@ def build_transport(
 
     glossy = np.flatnonzero(is_glossy(points))
     if len(glossy):
-        base, edge = builder.specular_rows(
-            take_points(points, glossy), view.to_eye[row_view[glossy]], stream[glossy], rays_per_row, progress
-        )
-        lobes.append(Lobe("specular_base", _spread_rows(base, glossy, len(row_view)), view.points.specular))
+        base, edge = builder.specular_rows(points, view.to_eye[row_view], stream, glossy, rays_per_row, progress)
+        lobes.append(Lobe("specular_base", base, view.points.specular))
         edge_tint = np.repeat(view.points.specular_edge[:, None], 3, axis=1)
-        lobes.append(Lobe("specular_edge", _spread_rows(edge, glossy, len(row_view)), edge_tint))
+        lobes.append(Lobe("specular_edge", edge, edge_tint))
 
     bounce = builder.diffuse_rows(
         gather.patch_points,
@@ -221,40 +220,65 @@ class _RowBuilder:
             cell, weight = self._cells(origins, directions, _mix(seed, 1 + first))
             if weight is None:
                 return self._merge_counts(cell, n_rays)
-            return self._merge(cell, weight / np.float32(n_rays), n_rays)
+            return self._merge(cell, weight[:, None] / np.float32(n_rays), n_rays)[0]
 
         return self._in_chunks(len(stream), n_rays, row_chunk, progress, step)
 
     def specular_rows(
-        self, points: SurfacePoints, to_eye: F32, stream: I64, n_rays: int, progress: Progress
+        self, points: SurfacePoints, to_eye: F32, stream: I64, glossy: I64, n_rays: int, progress: Progress
     ) -> tuple[SparseRows, SparseRows]:
-        """Rows that multiply the specular colour, and rows that multiply the specular edge."""
+        """Rows that multiply the specular colour, and rows that multiply the specular edge.
+
+        Both stand on the same directions, and share their columns in memory.
+        Weak reflections, of all dielectrics, take a quarter of the rays: their
+        noise is scaled down by their reflectance.
+        """
         seed = self._seed_for(2)
-        edges: list[SparseRows] = []
+        weak = points.specular[glossy].max(axis=1) < _WEAK_SPECULAR
+        second: list[F32] = []
+        parts: list[tuple[I64, SparseRows, F32]] = []
+        for rows, rays in ((glossy[~weak], n_rays), (glossy[weak], max(1, n_rays // 4))):
 
-        def row_chunk(first: int, last: int) -> SparseRows:
-            start = np.repeat(np.arange(first, last), n_rays)
-            u = np.empty((len(start), 2), np.float32)
-            kernels.point_sets(seed, stream[first:last], n_rays, u)
-            many = take_points(points, start)
-            directions, to_base, to_edge = sample_specular(many, np.ascontiguousarray(to_eye[start]), u)
-            origins = spawn_points(self._snapshot, many, directions)
-            cell, weight = self._cells(origins, directions, _mix(seed, 1 + first))
-            scale = np.float32(1.0 / n_rays) if weight is None else weight / np.float32(n_rays)
-            edges.append(self._merge(cell, to_edge * scale, n_rays))
-            return self._merge(cell, to_base * scale, n_rays)
+            def row_chunk(first: int, last: int, rows: I64 = rows, rays: int = rays) -> SparseRows:
+                start = np.repeat(rows[first:last], rays)
+                u = np.empty((len(start), 2), np.float32)
+                kernels.point_sets(seed, stream[rows[first:last]], rays, u)
+                many = take_points(points, start)
+                directions, to_base, to_edge = sample_specular(many, np.ascontiguousarray(to_eye[start]), u)
+                origins = spawn_points(self._snapshot, many, directions)
+                cell, weight = self._cells(origins, directions, _mix(seed, 1 + int(rows[first])))
+                both = np.stack([to_base, to_edge], axis=1) / np.float32(rays)
+                base, edge = self._merge(cell, both if weight is None else both * weight[:, None], rays)
+                second.append(edge)
+                return base
 
-        base = self._in_chunks(len(stream), 4 * n_rays, row_chunk, progress, "glossy gather rays")
-        return base, concatenate_rows(edges, self._gather.n)
+            if len(rows):
+                base = self._in_chunks(len(rows), rays, row_chunk, progress, "glossy gather rays", _RAYS_AT_ONCE // 4)
+                parts.append((rows, base, np.concatenate(second)))
+                second.clear()
+
+        whole = _scatter_rows([(rows, base) for rows, base, _ in parts], len(stream), self._gather.n)
+        if len(parts) == 1:
+            edge_weights = parts[0][2]
+        else:
+            edge_parts = [(rows, replace(base, weights=edge)) for rows, base, edge in parts]
+            edge_weights = _scatter_rows(edge_parts, len(stream), self._gather.n).weights
+        return whole, replace(whole, weights=edge_weights)
 
     def _seed_for(self, purpose: int) -> int:
         return _mix(self._seed, purpose)
 
     def _in_chunks(
-        self, n_rows: int, n_rays: int, row_chunk: Callable[[int, int], SparseRows], progress: Progress, step: str
+        self,
+        n_rows: int,
+        n_rays: int,
+        row_chunk: Callable[[int, int], SparseRows],
+        progress: Progress,
+        step: str,
+        rays_at_once: int = _RAYS_AT_ONCE,
     ) -> SparseRows:
         parts = []
-        at_once = max(1, _RAYS_AT_ONCE // n_rays)
+        at_once = max(1, rays_at_once // n_rays)
         progress(step, 0.0)
         for first in range(0, n_rows, at_once):
             last = min(first + at_once, n_rows)
@@ -298,30 +322,37 @@ class _RowBuilder:
         merged = np.empty((n, n_rays), np.int32)
         weights = np.empty((n, n_rays), np.float32)
         kernels.merge_counts(cell, n_rays, counts, merged, weights)
-        return self._pack(np.arange(n + 1) * n_rays, counts, merged.reshape(-1), weights.reshape(-1))
+        indptr = np.concatenate([[0], np.cumsum(counts)])
+        rows = SparseRows(indptr, np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32), self._gather.n)
+        row_kernels.pack_rows(counts, indptr, merged, weights, rows.indices, rows.weights)
+        return rows
 
-    def _merge(self, cell: I32, weight: F32, n_rays: int) -> SparseRows:
+    def _merge(self, cell: I32, weight: F32, n_rays: int) -> tuple[SparseRows, F32]:
+        """Rows of the first column of `weight` (n, k), and the last column's weights of the same entries."""
         n = len(cell) // n_rays
         counts = np.empty(n, np.int64)
-        merged, weights = np.empty_like(cell), np.empty(len(cell), np.float32)
-        begin = np.arange(n + 1) * n_rays
-        kernels.merge_weights(begin, cell, np.ascontiguousarray(weight, np.float32), counts, merged, weights)
-        return self._pack(begin, counts, merged, weights)
-
-    def _pack(self, begin: I64, counts: I64, cell: I32, weight: F32) -> SparseRows:
+        merged, weights = np.empty_like(cell), np.empty(weight.shape, np.float32)
+        kernels.merge_weights(n_rays, cell, np.ascontiguousarray(weight), counts, merged, weights)
         indptr = np.concatenate([[0], np.cumsum(counts)])
         indices = np.empty(indptr[-1], np.int32)
-        weights = np.empty(indptr[-1], np.float32)
-        kernels.pack_segments(begin, counts, indptr, cell, weight, indices, weights)
-        return SparseRows(indptr, indices, weights, self._gather.n)
+        packed = np.empty((weight.shape[1], indptr[-1]), np.float32)
+        kernels.pack_weights(n_rays, counts, indptr, merged, weights, indices, packed)
+        return SparseRows(indptr, indices, packed[0], self._gather.n), packed[-1]
 
 
 def _mix(seed: int, value: int) -> int:
     return int(hash_combine(seed & 0xFFFFFFFF, value))
 
 
-def _spread_rows(rows: SparseRows, place: I64, n_rows: int) -> SparseRows:
-    """The same rows at `place` among `n_rows`, the others empty."""
+def _scatter_rows(parts: list[tuple[I64, SparseRows]], n_rows: int, n_columns: int) -> SparseRows:
+    """One matrix of parts whose rows belong at given places, ascending in each part; other rows are empty."""
     counts = np.zeros(n_rows, np.int64)
-    counts[place] = np.diff(rows.indptr)
-    return SparseRows(np.concatenate([[0], np.cumsum(counts)]), rows.indices, rows.weights, rows.n_columns)
+    for place, rows in parts:
+        counts[place] = np.diff(rows.indptr)
+    indptr = np.concatenate([[0], np.cumsum(counts)])
+    if len(parts) == 1:
+        return SparseRows(indptr, parts[0][1].indices, parts[0][1].weights, n_columns)
+    out = SparseRows(indptr, np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32), n_columns)
+    for place, rows in parts:
+        row_kernels.place_rows(rows.indptr, indptr[place], rows.indices, rows.weights, out.indices, out.weights)
+    return out
