@@ -102,7 +102,10 @@ def test_form_factors_of_plates_are_the_row_sums():
 def test_rows_of_a_closed_room_sum_to_one():
     pipeline = Pipeline(closed_box(0.5, 1.0), n_gather=512, rays=64)
     np.testing.assert_allclose(pipeline.transport.lobes[0].rows.row_sums(), 1, atol=1e-5)
-    np.testing.assert_allclose(pipeline.transport.bounce.row_sums(), 1, atol=1e-5)
+    points = pipeline.gather.points
+    inside = np.einsum("ij,ij->i", points.normal, points.position) < 0
+    assert inside.sum() > 500
+    np.testing.assert_allclose(pipeline.transport.bounce.row_sums()[inside], 1, atol=1e-5)
 
 
 def lit_room(scale: float = 1.0):

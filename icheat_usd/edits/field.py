@@ -60,12 +60,12 @@ def _bilinear(texels: F32, rows: I64, uv: F32) -> F32:
 
 @dataclass(frozen=True, eq=False)
 class BoundEdit:
-    """An edit that knows the scene: its operation, and a pair of masks and a weight for each key."""
+    """An edit that knows the scene: its operation, and parameters, masks and a weight for each key."""
 
     edit: Edit
     operation: Operation | None  #: None: unknown here, `baked` is used
-    parameters: dict[str, Value]
-    baked: tuple[F32, ...]  #: per key: scale - 1 baked by who authored it; unused where the operation is known
+    parameters: tuple[dict[str, Value], ...]
+    baked: tuple[F32, ...]  #: scale - 1, baked by who authored it; unused where the operation is known
     receivers: tuple[BoundMask, ...]
     casters: tuple[BoundMask, ...]
     key_weights: tuple[float, ...]
@@ -74,7 +74,7 @@ class BoundEdit:
         """Coefficients at full amount and masks, as of one key."""
         if self.operation is None:
             return PairCoefficients(scale=np.float32(1) + self.baked[key][None, :])
-        return self.operation.evaluate(self.parameters, Pairs(incident))
+        return self.operation.evaluate(self.parameters[key], Pairs(incident))
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,26 +205,28 @@ def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
 def _bind_edit(edit: Edit, snapshot: SceneSnapshot) -> BoundEdit:
     operation = operations.find(edit.operation)
     keys = [(key.payload, key.weight) for key in edit.keys if key.payload is not None]
-    if operation is None and (not keys or any(payload.scale_delta is None for payload, _ in keys if payload)):
+    if operation is None and (not keys or any(payload.scale_delta is None for payload, _ in keys)):
         raise EditError(
             f"{edit.path}: operation '{edit.operation}' is unknown and no payload holds it baked;"
             f" known are {', '.join(operations.names())}; install the package that brings it, or mute the edit"
         )
-    parameters = operation.complete(edit.parameters, edit.path) if operation else {}
     if not edit.keys:
-        plain = (BoundMask(_member(edit.receivers, snapshot), None, _NO_FACES),)
-        return BoundEdit(edit, operation, parameters, (), plain, (_caster_mask(edit, None, snapshot),), (1.0,))
-    baked = tuple(np.asarray(p.scale_delta or (0.0, 0.0, 0.0), np.float32) for p, _ in keys if p)
-    receivers = tuple(_bound_mask(edit, edit.receivers, p.receiver_mask, snapshot) for p, _ in keys if p)
-    casters = tuple(_caster_mask(edit, p.caster_mask, snapshot) for p, _ in keys if p)
-    return BoundEdit(edit, operation, parameters, baked, receivers, casters, tuple(weight for _, weight in keys))
+        plain = {} if operation is None else operation.complete(edit.parameters, edit.path)
+        receivers = _bound_mask(edit, edit.receivers, None, snapshot)
+        casters = _bound_mask(edit, edit.casters, None, snapshot)
+        return BoundEdit(edit, operation, (plain,), (), (receivers,), (casters,), (1.0,))
+    return BoundEdit(
+        edit,
+        operation,
+        parameters=tuple({} if operation is None else operation.complete(p.parameters, edit.path) for p, _ in keys),
+        baked=tuple(np.asarray(p.scale_delta or (0.0, 0.0, 0.0), np.float32) for p, _ in keys),
+        receivers=tuple(_bound_mask(edit, edit.receivers, p.receiver_mask, snapshot) for p, _ in keys),
+        casters=tuple(_bound_mask(edit, edit.casters, p.caster_mask, snapshot) for p, _ in keys),
+        key_weights=tuple(weight for _, weight in keys),
+    )
 
 
 _NO_FACES = np.zeros(0, np.int64)
-
-
-def _caster_mask(edit: Edit, mask: SurfaceMask | None, snapshot: SceneSnapshot) -> BoundMask:
-    return _bound_mask(edit, edit.casters, mask, snapshot)
 
 
 def _member(selection: Selection, snapshot: SceneSnapshot) -> F32:

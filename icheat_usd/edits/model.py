@@ -97,8 +97,9 @@ class Edit:
     """One adjustment as composed at one time code, before it meets a scene.
 
     `keys` is empty for an edit that needs no payload, else one or two whose
-    weights sum to 1. `parameters` holds what USD says (authored opinions
-    over schema fallbacks over the payload's recipe).
+    weights sum to 1. `parameters` are authored opinions over the payload's
+    recipe over schema fallbacks, mixed over the keys; each key's payload has
+    its own.
     """
 
     path: str

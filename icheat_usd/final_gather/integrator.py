@@ -26,7 +26,7 @@ from icheat_usd.materials import is_glossy, sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
 from icheat_usd.samples.develop import average, develop
-from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, I64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
 #: Gather rays in flight; bounds memory and keeps a chunk's arrays near the caches.
@@ -173,7 +173,7 @@ def _band(gatherer: _Gatherer, view: ViewSamples, pixels: tuple[int, int], seed:
 def _indirect(gatherer: _Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, seed: int) -> _Light:
     """Indirect radiance that the points send to the eye, unedited and edited."""
     receiver = gatherer.field.receiver_masks(points)
-    touched = (receiver > 0).any(axis=0)
+    touched: Bool = np.asarray((receiver > 0).any(axis=0), np.bool_)
     n_rays = gatherer.settings.gather_rays
     hits, through = trace_hemisphere(gatherer.snapshot, gatherer.tracer, points, stream, n_rays, seed)
     diffuse = _sum_rays(gatherer, hits, through, receiver, touched, n_rays, seed)
@@ -181,7 +181,15 @@ def _indirect(gatherer: _Gatherer, points: SurfacePoints, to_eye: F32, stream: I
     edited = points.albedo * diffuse.edited
     glossy = np.flatnonzero(is_glossy(points))
     if len(glossy):
-        specular = _specular(gatherer, take_points(points, glossy), to_eye[glossy], stream[glossy], receiver[:, glossy], touched[glossy], seed)
+        specular = _specular(
+            gatherer,
+            take_points(points, glossy),
+            to_eye[glossy],
+            stream[glossy],
+            receiver[:, glossy],
+            touched[glossy],
+            seed,
+        )
         base[glossy] += specular.base
         edited[glossy] += specular.edited
     if gatherer.field.has_offset and touched.any():
@@ -189,7 +197,8 @@ def _indirect(gatherer: _Gatherer, points: SurfacePoints, to_eye: F32, stream: I
         gather, b = gatherer.offsets, gatherer.offset_radiance
         assert gather is not None and b is not None
         casters = gatherer.field.caster_masks(gather.points)
-        edited[which] += offset_radiance(gatherer.field, b, gather.area, receiver[:, which], casters, points.albedo[which])
+        albedo = points.albedo[which]
+        edited[which] += offset_radiance(gatherer.field, b, gather.area, receiver[:, which], casters, albedo)
     edited = np.where(touched[:, None], np.maximum(edited, np.float32(0)), base)
     return _Light(base, edited)
 
@@ -200,7 +209,7 @@ def _specular(
     to_eye: F32,
     stream: I64,
     receiver: F32,
-    touched: np.ndarray,
+    touched: Bool,
     seed: int,
 ) -> _Light:
     """The specular lobe's share, by rays that follow the lobe."""
@@ -229,7 +238,7 @@ def _lobe_numbers(stream: I64, n_rays: int, seed: int) -> F32:
 
 
 def _sum_rays(
-    gatherer: _Gatherer, hits: SurfacePoints, through: F32, receiver: F32, touched: np.ndarray, n_rays: int, seed: int
+    gatherer: _Gatherer, hits: SurfacePoints, through: F32, receiver: F32, touched: Bool, n_rays: int, seed: int
 ) -> _Light:
     """Mean over each point's rays of the light they bring, unedited and edited."""
     brought = reflected_radiance(

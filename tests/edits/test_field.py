@@ -34,7 +34,8 @@ def bound(operation: Operation, parameters=(), *, amount=1.0, blend=Blend.COMPOS
     edit = Edit("/edit", operation.name, dict(parameters), NOWHERE, NOWHERE, amount=amount, blend=blend)
     empty = BoundMask(np.zeros(0, np.float32), None, np.zeros(0, np.int64))
     masks = (empty,) * len(key_weights)
-    return BoundEdit(edit, operation, operation.complete(edit.parameters, "/edit"), (), masks, masks, key_weights)
+    complete = (operation.complete(edit.parameters, "/edit"),) * len(key_weights)
+    return BoundEdit(edit, operation, complete, (), masks, masks, key_weights)
 
 
 def random_pairs(n: int, n_rows: int, seed: int = 1):

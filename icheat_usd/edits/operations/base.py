@@ -12,6 +12,13 @@ from icheat_usd.errors import EditError
 from icheat_usd.scene import F32
 
 
+def number(parameters: Mapping[str, Value], name: str) -> float:
+    """A parameter that `Operation.complete` has checked to be a number."""
+    value = parameters[name]
+    assert isinstance(value, (int, float))
+    return float(value)
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One input of an operation: USD attribute ``icheat:<operation>:<name>``."""

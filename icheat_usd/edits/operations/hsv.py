@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from icheat_usd.edits.model import Value
-from icheat_usd.edits.operations.base import Operation, PairCoefficients, Pairs, Parameter
+from icheat_usd.edits.operations.base import Operation, PairCoefficients, Pairs, Parameter, number
 from icheat_usd.scene import F32
 
 #: A channel's ratio is formed where the channel holds more than this share of the pair's largest one ...
@@ -39,10 +39,8 @@ class Hsv(Operation):
 
     def evaluate(self, parameters: Mapping[str, Value], pairs: Pairs) -> PairCoefficients:
         incident = np.maximum(pairs.incident, np.float32(0))
-        wanted = adjust_hsv(
-            incident, float(parameters["hue"]), float(parameters["saturation"]), float(parameters["value"])
-        )
-        return divide(incident, wanted)
+        hue, saturation, value = (number(parameters, name) for name in ("hue", "saturation", "value"))
+        return divide(incident, adjust_hsv(incident, hue, saturation, value))
 
 
 def adjust_hsv(rgb: F32, hue: float, saturation: float, value: float) -> F32:
@@ -78,5 +76,5 @@ def divide(incident: F32, wanted: F32) -> PairCoefficients:
     floor = RELATIVE_EPSILON * incident.max(axis=1, keepdims=True)
     divisible = incident > np.maximum(floor, np.float32(0))
     ratio = np.where(divisible, wanted / np.where(divisible, incident, np.float32(1)), np.float32(1))
-    ratio = np.minimum(ratio, MAX_RATIO)
-    return PairCoefficients(scale=ratio, emission=wanted - ratio * incident)
+    ratio = np.minimum(ratio, MAX_RATIO).astype(np.float32)
+    return PairCoefficients(scale=ratio, emission=(wanted - ratio * incident).astype(np.float32))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from icheat_usd.edits.model import Value
-from icheat_usd.edits.operations.base import Operation, PairCoefficients, Pairs, Parameter
+from icheat_usd.edits.operations.base import Operation, PairCoefficients, Pairs, Parameter, number
 
 
 class Scale(Operation):
@@ -22,7 +22,7 @@ class Scale(Operation):
 
     def evaluate(self, parameters: Mapping[str, Value], pairs: Pairs) -> PairCoefficients:
         color = np.asarray(parameters["color"], np.float32)
-        return PairCoefficients(scale=(np.float32(parameters["gain"]) * color)[None, :])
+        return PairCoefficients(scale=(np.float32(number(parameters, "gain")) * color)[None, :])
 
     def constant_delta(self, parameters: Mapping[str, Value]) -> tuple[float, float, float]:
         red, green, blue = self.evaluate(parameters, Pairs(np.zeros((1, 3), np.float32))).scale[0]
