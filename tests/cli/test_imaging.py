@@ -1,0 +1,83 @@
+"""`relight` and `render` from the command line to files."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icheat_usd.cli import main
+from icheat_usd.image.exr import read_exr
+from icheat_usd.resources import resource_path
+
+BOX = str(resource_path("sample_stages/cornell_box/shot.usda"))
+ANIMATED = str(resource_path("sample_stages/animated_room/shot.usda"))
+LAYERS = {"beauty", "direct", "indirect", "indirect_edited", "edit_delta", "albedo", "normal", "depth"}
+QUICK = ["--width", "16", "--height", "16"]
+SMALL = [*QUICK, "--draft", "--gather", "512", "--rays", "32", "--bounces", "3"]
+
+
+def test_a_preview_is_written_in_every_form_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    exr, png = tmp_path / "box.exr", tmp_path / "box.png"
+    assert main(["relight", BOX, "-o", str(exr), "-o", str(png), *SMALL, "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["version"] == 1 and content["findings"] == []
+    (image,) = content["images"]
+    assert image["files"] == [str(exr), str(png)] and (image["width"], image["height"]) == (16, 16)
+    assert image["metadata"]["stack"] == "/World/Edits" and image["metadata"]["camera"] == "/World/Cameras/Main"
+    assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    film = read_exr(exr)
+    assert set(film.layers) >= LAYERS
+    layers = film.layers
+    assert np.allclose(layers["indirect"] + layers["edit_delta"], layers["indirect_edited"], atol=1e-6)
+    assert np.abs(layers["edit_delta"]).max() > 0.01
+
+
+def test_a_final_frame_agrees_with_the_preview(tmp_path: Path) -> None:
+    preview, final = tmp_path / "preview.exr", tmp_path / "final.exr"
+    effort = ["--samples", "4", "--rays", "64"]
+    assert main(["relight", BOX, "-o", str(preview), *QUICK, "--gather", "4096", *effort]) == 0
+    assert main(["render", BOX, "-o", str(final), *QUICK, *effort]) == 0
+    for layer in ("direct", "indirect", "indirect_edited"):
+        ratio = read_exr(preview).layers[layer].mean() / read_exr(final).layers[layer].mean()
+        assert ratio == pytest.approx(1.0, abs=0.05), layer
+
+
+def test_frames_go_to_numbered_files_and_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pattern = str(tmp_path / "room.####.exr")
+    assert main(["relight", ANIMATED, "-o", pattern, "--frames", "10:40x30", *SMALL]) == 0
+    first, last = tmp_path / "room.0010.exr", tmp_path / "room.0040.exr"
+    assert capsys.readouterr().out.split() == [str(first), str(last)]
+    assert {path.name for path in tmp_path.iterdir()} == {first.name, last.name}
+    assert not np.array_equal(read_exr(first).layers["depth"], read_exr(last).layers["depth"])
+    assert read_exr(last).metadata["frame"] == "40"
+
+
+def test_the_same_seed_gives_the_same_bits(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        assert main(["relight", BOX, "-o", str(tmp_path / f"{name}.exr"), *SMALL, "--seed", "3"]) == 0
+    a, b = read_exr(tmp_path / "a.exr"), read_exr(tmp_path / "b.exr")
+    assert all(np.array_equal(a.layers[name], b.layers[name]) for name in LAYERS)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_an_interrupted_render_leaves_nothing_behind(tmp_path: Path) -> None:
+    out = tmp_path / "final.exr"
+    arguments = [sys.executable, "-m", "icheat_usd", "render", BOX, "-o", str(out), "--samples", "4096"]
+    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    # The first line of progress says that work is under way.
+    started = process.stderr.readline()
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, rest = process.communicate(timeout=120)
+    assert process.returncode == 130, started + rest
+    assert "interrupted" in rest and "Traceback" not in rest
+    assert list(tmp_path.iterdir()) == []
