@@ -20,6 +20,7 @@ from icheat_usd.transport.interpolate import sparse_rows_of_view
 from icheat_usd.transport.sparse import SparseRows, concatenate_rows
 
 _RAYS_AT_ONCE = 1 << 20
+_DETOUR_DEPTH = 8  # mirrors and faces of glass on a gather ray: what is trapped for longer is darkness to the row
 _WEAK_SPECULAR = 0.2  # reflectance at normal incidence; dielectrics have 0.02 to 0.17
 _CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
 
@@ -310,7 +311,7 @@ class _RowBuilder:
         rest = np.flatnonzero(detour)
         if not len(rest):
             return cell, None
-        ends = first_surfaces(self._snapshot, self._tracer, origins[rest], directions[rest], seed)
+        ends = first_surfaces(self._snapshot, self._tracer, origins[rest], directions[rest], seed, _DETOUR_DEPTH)
         cell[rest] = self._gather.locate(ends.points)
         weight = np.ones(len(cell), np.float32)
         weight[rest] = ends.throughput.mean(axis=1)

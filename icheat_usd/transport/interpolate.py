@@ -34,8 +34,12 @@ def sparse_rows_of_view(view: ViewSamples, camera: Camera, spacing: int) -> tupl
     Notes
     -----
     Neighbours are looked for in the image, then accepted by place and normal,
-    so nothing leaks across silhouettes. Weights: Franke and Little, as
-    cited by Shepard-type interpolation surveys; continuous where the set of neighbours changes.
+    so nothing leaks across silhouettes. Franke-Little weights [1]_ are continuous
+    where the set of neighbours changes.
+
+    References
+    ----------
+    .. [1] Franke 1982, Scattered Data Interpolation: Tests of Some Methods, Mathematics of Computation 38.
     """
     x, y = view.pixel % view.width, view.pixel // view.width
     n_blocks_x = (view.width + spacing - 1) // spacing
