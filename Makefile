@@ -12,7 +12,7 @@ PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
 	&& command -v $$name && break; done)
 PYTEST_ARGS ?= -q
 
-.PHONY: demo test lint clean
+.PHONY: demo test test-oldest-usd lint clean
 .DEFAULT_GOAL := test
 
 $(BIN)/python:
@@ -38,6 +38,19 @@ lint: $(VENV)/.installed-dev
 
 test: lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	@$(MAKE) --no-print-directory test-oldest-usd
+
+# DCCs lag behind: what reads and writes stages is also tested on the oldest USD that pyproject.toml allows.
+OLDEST_USD = $(shell $(BIN)/python -c 'import sys; print("25.5" if sys.version_info < (3, 13) else "25.8")')
+
+$(VENV)/.oldest-usd: pyproject.toml | $(VENV)/.installed-dev
+	rm -rf $(VENV)/oldest-usd
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(VENV)/oldest-usd \
+		usd-core==$(OLDEST_USD)
+	@touch $@
+
+test-oldest-usd: $(VENV)/.oldest-usd
+	PYTHONPATH=$(CURDIR)/$(VENV)/oldest-usd $(BIN)/python -m pytest $(PYTEST_ARGS) tests/stage tests/cli/test_main.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis demo_output

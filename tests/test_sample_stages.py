@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("pxr")
 
-from pxr import Sdf, Usd, UsdGeom, UsdRender  # noqa: E402
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdRender  # noqa: E402
 
 from icheat_usd.session import Quality, Session, inspection  # noqa: E402
 
@@ -39,7 +39,10 @@ def test_the_folder_holds_the_stages_and_none_is_large() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_usd_finds_nothing_wrong(name: str, layer: str) -> None:
     validation = pytest.importorskip("pxr.UsdValidation", reason="usd-core before 25.2 has no validators")
-    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    try:
+        validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    except Tf.ErrorException:
+        pytest.skip("the wheels of usd-core 25.5 name validators whose libraries they lack")
     stage = Usd.Stage.Open(str(STAGES / name / f"{layer}.usda"))
     errors = validation.ValidationContext(validators).Validate(stage)
     assert [f"{error.GetName()}: {error.GetMessage()}" for error in errors] == []

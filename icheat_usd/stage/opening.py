@@ -62,10 +62,16 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
 def composition_findings(stage: Usd.Stage) -> tuple[Finding, ...]:
     """What the stage refers to and could not compose, one finding per missing asset (or per prim without one)."""
     grouped: dict[tuple[str, str], tuple[str, str, int]] = {}
-    for error in stage.GetCompositionErrors():
-        text = " ".join(str(error).split())
-        kind = type(error).__name__.removeprefix("Error")
-        prim = str(getattr(getattr(error, "rootSite", None), "path", "")) or "/"
+    errors = [
+        (
+            type(error).__name__.removeprefix("Error"),
+            str(getattr(getattr(error, "rootSite", None), "path", "")) or "/",
+            " ".join(str(error).split()),
+        )
+        for error in stage.GetCompositionErrors()
+    ]
+    # USD composes in parallel: the order in which it finds errors differs from run to run.
+    for kind, prim, text in sorted(errors):
         asset = re.search(r"@([^@]+)@", text)
         key = (kind, asset.group(1) if asset else prim)
         first_prim, first_text, count = grouped.get(key, (prim, text, 0))

@@ -79,10 +79,15 @@ def features(library: MaterialLibrary) -> list[str]:
 
 
 def test_unauthored_inputs_have_the_fallbacks_of_the_shader_definition(tmp_path: Path) -> None:
-    from pxr import Sdr
+    from pxr import Sdr, Tf
 
     table, row, library = read(write_stage(tmp_path, surface("")))
-    node = Sdr.Registry().GetShaderNodeByIdentifier("UsdPreviewSurface")
+    try:
+        node = Sdr.Registry().GetShaderNodeByIdentifier("UsdPreviewSurface")
+    except Tf.ErrorException:
+        node = None
+    if node is None:
+        pytest.skip("the wheels of usd-core 25.5 lack the shader definitions")
 
     def default(name: str) -> Any:
         return node.GetShaderInput(name).GetDefaultValue()

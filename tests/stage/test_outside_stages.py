@@ -152,6 +152,8 @@ def test_a_broken_stage_says_what_is_missing_once(shared_scenes: Path, capfd: py
 
 
 def test_a_file_too_old_for_usd_is_an_error_of_one_sentence(shared_scenes: Path) -> None:
+    if Usd.GetVersion() < (0, 26, 11):
+        pytest.skip("older USD may still read it")
     with pytest.raises(StageError, match="obsolete version"):
         open_stage(shared_scenes / "maya_pointinstancer/ballset_StandaloneScene/Room_set.usd")
 
