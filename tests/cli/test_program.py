@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from icheat_usd.cli import main
-from icheat_usd.cli.program import VERBS, build_parser
 from icheat_usd.cli.options import assignment, read_value
+from icheat_usd.cli.program import VERBS, build_parser
 from icheat_usd.errors import EditError
 
 STAGE = """#usda 1.0
