@@ -121,7 +121,7 @@ class Lights(NamedTuple):
     to_world: F32  #: (n, 3, 4)
     radiance: F32  #: (n, 3) with intensity, exposure, normalize and colour temperature applied;
     #: multiplies the image for textured lights; for MESH a multiplier (1) of the material's emission
-    size: F32  #: (n, 2) sphere, disk: radius; rect: width, height; cylinder: radius, length; distant: half-angle in radians
+    size: F32  #: (n, 2) sphere, disk: radius; rect: width, height; cylinder: radius, length; distant: half-angle, rad
     texture: I32  #: (n,) row of `Textures` or -1; domes (lat-long) and rects
     surface: I32  #: (n,) MESH: row of `SceneSnapshot.surfaces`, else -1
     triangle_begin: I64  #: (n + 1,) MESH: its rows in the two columns below
@@ -221,7 +221,7 @@ class SurfacePoints(NamedTuple):
     face_uv: F32  #: (n, 2)
     albedo: F32  #: (n, 3) diffuse reflectance
     specular: F32  #: (n, 3) Fresnel reflectance at normal incidence; Schlick, towards `specular_edge` at grazing
-    specular_edge: F32  #: (n,) reflectance at grazing: 1 where there is an interface, 0 where ior is 1
+    specular_edge: F32  #: (n, 3) reflectance at grazing: white for a dielectric, a metal's own colour, 0 where ior is 1
     roughness: F32  #: (n,) UsdPreviewSurface roughness; GGX alpha = roughness^2
     emission: F32  #: (n, 3) radiance
     delta: U8  #: (n,) `DeltaKind`

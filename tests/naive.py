@@ -45,7 +45,9 @@ class NaiveScene:
             corners.append(geometry.points[rows].astype(float) @ m[:, :3].T + m[:, 3])
             material = geometry.material[rows]
             colour = np.where(
-                materials.use_display_color[material][:, None] == 1, geometry.color[rows][:, 0], materials.diffuse[material]
+                materials.use_display_color[material][:, None] == 1,
+                geometry.color[rows][:, 0],
+                materials.diffuse[material],
             )
             albedo.append(colour.astype(float))
             emission.append(materials.emission[material].astype(float))

@@ -158,7 +158,9 @@ class EditField:
                 factor, carried = 1 - kept, 1 - kept
             else:
                 factor = carried = np.ones_like(delta)
-            scale[touched] = factor * scale[touched] + {Blend.COMPOSE: 0, Blend.OVER: kept + delta, Blend.ADD: delta}[blend]
+            scale[touched] = (
+                factor * scale[touched] + {Blend.COMPOSE: 0, Blend.OVER: kept + delta, Blend.ADD: delta}[blend]
+            )
             emission[touched] = carried * emission[touched] + added
             paints = bound.operation is not None and not bound.operation.offset_times_albedo
             for slot in range(2):

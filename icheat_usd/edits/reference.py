@@ -17,7 +17,9 @@ from icheat_usd.scene import F32
 F64Array = NDArray[np.float64]
 
 
-def pair_functions(field: EditField, b: F64Array, u: F64Array, w: F64Array) -> tuple[F64Array, F64Array, F64Array, F64Array]:
+def pair_functions(
+    field: EditField, b: F64Array, u: F64Array, w: F64Array
+) -> tuple[F64Array, F64Array, F64Array, F64Array]:
     """S, E and the two kinds of O for one pair.
 
     Parameters

@@ -85,7 +85,7 @@ def final_gather(
     tracer: Tracer,
     field: EditField,
     *,
-    settings: GatherSettings = GatherSettings(),
+    settings: GatherSettings,
     gather: GatherSamples | None = None,
     gather_radiance: F32 | None = None,
     progress: Progress = silent,
@@ -225,7 +225,7 @@ def _specular(
         directions,
         int(hash_combine(seed, 1)),
     )
-    reflectance = base_weight[:, None] * repeated.specular + (edge_weight * repeated.specular_edge)[:, None]
+    reflectance = base_weight[:, None] * repeated.specular + edge_weight[:, None] * repeated.specular_edge
     lit = (ends.points.instance >= 0)[:, None]
     through = np.where(lit, reflectance * ends.throughput, np.float32(0)).astype(np.float32)
     return _sum_rays(gatherer, ends.points, through, receiver, touched, n_rays, int(hash_combine(seed, 2)))

@@ -79,6 +79,17 @@ def specular_terms(n: Vector, geometric: Vector, to_eye: Vector, to_light: Vecto
     return value * (1.0 - edge), value * edge
 
 
+@kernel
+def has_lobe(points: tuple, i: int) -> bool:
+    """Whether the point scatters light into a specular lobe."""
+    if points.delta[i] != 0:
+        return False
+    for c in range(3):
+        if points.specular[i, c] > 0.0 or points.specular_edge[i, c] > 0.0:
+            return True
+    return False
+
+
 @parallel_kernel
 def evaluate(points: tuple, to_eye: np.ndarray, to_light: np.ndarray, out: np.ndarray) -> None:
     """BRDF times the light's cosine."""
@@ -89,13 +100,13 @@ def evaluate(points: tuple, to_eye: np.ndarray, to_light: np.ndarray, out: np.nd
             eye, light = normalized(row3(to_eye, i)), normalized(row3(to_light, i))
             cosine = lobe_cosines(normal, geometric, eye, light)[1]
             base, edge = 0.0, 0.0
-            if points.specular_edge[i] > 0.0 and points.delta[i] == 0:
+            if has_lobe(points, i):
                 base, edge = specular_terms(normal, geometric, eye, light, lobe_alpha(points.roughness[i]))
             for c in range(3):
                 out[i, c] = (
                     points.albedo[i, c] * (cosine / math.pi)
                     + points.specular[i, c] * base
-                    + points.specular_edge[i] * edge
+                    + points.specular_edge[i, c] * edge
                 )
 
 
@@ -110,7 +121,7 @@ def evaluate_specular(
             base[i] = 0.0
             edge[i] = 0.0
             pdf[i] = 0.0
-            if points.specular_edge[i] > 0.0 and points.delta[i] == 0:
+            if has_lobe(points, i):
                 normal, geometric = row3(points.shading_normal, i), row3(points.normal, i)
                 eye, light = normalized(row3(to_eye, i)), normalized(row3(to_light, i))
                 alpha = lobe_alpha(points.roughness[i])
@@ -156,7 +167,7 @@ def sample_specular(
             base[i] = 0.0
             edge[i] = 0.0
             store3(directions, i, normal)
-            if points.instance[i] < 0 or not (points.specular_edge[i] > 0.0) or points.delta[i] != 0:
+            if points.instance[i] < 0 or not has_lobe(points, i):
                 continue
             alpha = lobe_alpha(points.roughness[i])
             tangent, bitangent = frame(normal)
@@ -260,4 +271,4 @@ def split_delta(
                 weight_mirrored[i, c] = reflectance
                 if kind == 1:
                     f0 = points.specular[i, c]
-                    weight_mirrored[i, c] = points.opacity[i] * (f0 + (points.specular_edge[i] - f0) * share)
+                    weight_mirrored[i, c] = points.opacity[i] * (f0 + (points.specular_edge[i, c] - f0) * share)

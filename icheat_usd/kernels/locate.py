@@ -25,6 +25,7 @@ class LocatorTable(NamedTuple):
     slot: NDArray[np.int32]  #: (n_instances * 2,) group of samples of ``2 * instance + side``
     slot_begin: NDArray[np.int32]  #: (n_slots + 1,) its samples
     slot_record: NDArray[np.int32]  #: (n_slots,) its record, or -1 where it has none
+    slot_detour: NDArray[np.float32]  #: (n_slots,) squared metres added to the distance of a disagreeing normal
 
 
 @kernel
@@ -75,10 +76,10 @@ def _box_distance(record, r, first, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _nearest(table, begin, end, root, x, y, z, nx, ny, nz, agree, stack, bound):  # type: ignore[no-untyped-def]
-    """Nearest sample of ``begin:end`` whose normal agrees by more than `agree`; -1 if none does."""
+def _nearest(table, begin, end, root, x, y, z, nx, ny, nz, detour, stack, bound):  # type: ignore[no-untyped-def]
+    """Nearest sample of ``begin:end``, those whose normal disagrees being further away by `detour`."""
     record, sample = table.record, table.sample
-    best = np.int64(-1)
+    best = np.int64(begin)
     best_distance = np.float32(np.inf)
     depth = 0
     # What is to be visited: a record, or -1 - the first of `count` samples.
@@ -107,7 +108,9 @@ def _nearest(table, begin, end, root, x, y, z, nx, ny, nz, agree, stack, bound):
             dz = sample[j, 2] - z
             d = dx * dx + dy * dy + dz * dz
             if d < best_distance or (d == best_distance and j < best):
-                if sample[j, 3] * nx + sample[j, 4] * ny + sample[j, 5] * nz > agree:
+                if sample[j, 3] * nx + sample[j, 4] * ny + sample[j, 5] * nz <= _AGREE:
+                    d += detour
+                if d < best_distance or (d == best_distance and j < best):
                     best_distance = d
                     best = np.int64(j)
         found = False
@@ -123,16 +126,13 @@ def _nearest(table, begin, end, root, x, y, z, nx, ny, nz, agree, stack, bound):
 
 @kernel
 def nearest_sample(table, instance, side, x, y, z, nx, ny, nz, stack, bound):  # type: ignore[no-untyped-def]
-    """Sample of a place: the nearest on its side of its instance, with an agreeing normal if there is one."""
+    """Sample of a place: the nearest on its side of its instance, preferably with an agreeing normal."""
     slot = table.slot[2 * instance + side]
     begin, end = table.slot_begin[slot], table.slot_begin[slot + 1]
     if end - begin == 1:
         return np.int64(begin)
     root = table.slot_record[slot]
-    best = _nearest(table, begin, end, root, x, y, z, nx, ny, nz, _AGREE, stack, bound)
-    if best < 0:
-        best = _nearest(table, begin, end, root, x, y, z, nx, ny, nz, np.float32(-2.0), stack, bound)
-    return best
+    return _nearest(table, begin, end, root, x, y, z, nx, ny, nz, table.slot_detour[slot], stack, bound)
 
 
 @parallel_kernel

@@ -364,8 +364,8 @@ def reflectances(
                 for c in range(3):
                     out_albedo[i, c] = 0.0
                     out_specular[i, c] = 0.0
+                    out_specular_edge[i, c] = 0.0
                     out_emission[i, c] = 0.0
-                out_specular_edge[i] = 0.0
                 out_roughness[i] = 0.0
                 out_delta[i] = NONE
                 out_opacity[i] = 0.0
@@ -377,7 +377,6 @@ def reflectances(
             ior = np.float64(iors[m])
             ratio = (ior - 1.0) / (ior + 1.0) if ior > 0.0 else 0.0
             dielectric = ratio * ratio * (1.0 - metallic)
-            edge = metallic if ior == 1.0 else 1.0
 
             delta = NONE
             keep_emission = True
@@ -395,25 +394,26 @@ def reflectances(
                 diffuse = unit(inputs[i, DIFFUSE, c])
                 albedo = diffuse * (1.0 - metallic)
                 specular = dielectric + metallic * diffuse
+                edge = metallic * diffuse + (0.0 if ior == 1.0 else 1.0 - metallic)
                 if use_specular[m] != 0:
                     albedo = diffuse
                     specular = unit(inputs[i, SPECULAR, c])
+                    edge = 1.0 if ior != 1.0 or specular > 0.0 else 0.0
+                # What the interface reflects does not reach the diffuse base.
+                albedo *= 1.0 - specular
                 if delta != NONE:
                     albedo = 0.0
                 if delta == PASS:
                     specular = 0.0
+                    edge = 0.0
                 largest_albedo = max(largest_albedo, albedo)
                 largest_specular = max(largest_specular, specular)
                 out_albedo[i, c] = albedo
                 out_specular[i, c] = specular
+                out_specular_edge[i, c] = edge
                 out_emission[i, c] = max(inputs[i, EMISSION, c], np.float32(0.0)) if keep_emission else np.float32(0.0)
-            if use_specular[m] != 0:
-                edge = 1.0 if ior != 1.0 or largest_specular > 0.0 else 0.0
-            if delta == PASS:
-                edge = 0.0
-            elif delta == NONE and roughness <= MIRROR_ROUGHNESS and largest_albedo <= 0.0 and largest_specular > 0.0:
+            if delta == NONE and roughness <= MIRROR_ROUGHNESS and largest_albedo <= 0.0 and largest_specular > 0.0:
                 delta = MIRROR
-            out_specular_edge[i] = edge
             out_roughness[i] = roughness
             out_delta[i] = delta
             out_opacity[i] = opacity

@@ -94,7 +94,7 @@ def step_paths(
                 largest = 0.0
                 for c in range(3):
                     f0 = points.specular[i, c]
-                    throughput[i, c] *= f0 + (points.specular_edge[i] - f0) * share
+                    throughput[i, c] *= f0 + (points.specular_edge[i, c] - f0) * share
                     largest = max(largest, throughput[i, c])
                 state[i] = FOLLOWED if largest > 0.0 else ABSORBED
 

@@ -174,14 +174,15 @@ def _response(chunk: SurfacePoints, to_eye: F32, rays: _ShadowRays, n_samples: i
     glossy = np.flatnonzero(is_glossy(points))
     if n_samples is None or not len(glossy):
         return evaluate(points, eye, rays.direction)
-    diffuse = points._replace(specular_edge=np.zeros_like(points.specular_edge))
+    none = np.zeros_like(points.specular)
+    diffuse = points._replace(specular=none, specular_edge=none)
     value = evaluate(diffuse, eye, rays.direction)
     points = take_points(points, glossy)
     terms = evaluate_specular(points, eye[glossy], rays.direction[glossy])
     weight = _power_heuristic(
         n_samples * rays.pdf[glossy].astype(np.float64), _n_specular(n_samples) * terms.pdf.astype(np.float64)
     )
-    lobe = points.specular * terms.base[:, None] + (points.specular_edge * terms.edge)[:, None]
+    lobe = points.specular * terms.base[:, None] + points.specular_edge * terms.edge[:, None]
     value[glossy] += lobe * weight
     return value
 
@@ -255,7 +256,7 @@ def _specular_rays(
     owner = np.repeat(np.arange(len(chosen)), count)
     starts, eye = take_points(points, chosen[owner]), to_eye[chosen[owner]]
     direction, base, edge = sample_specular(starts, eye, numbers)
-    weight = (starts.specular * base[:, None] + (starts.specular_edge * edge)[:, None]) * np.float32(1.0 / count)
+    weight = (starts.specular * base[:, None] + starts.specular_edge * edge[:, None]) * np.float32(1.0 / count)
     alive = np.flatnonzero(weight.any(axis=1))
     starts, direction = take_points(starts, alive), np.ascontiguousarray(direction[alive])
     pdf = evaluate_specular(starts, eye[alive], direction).pdf.astype(np.float64)

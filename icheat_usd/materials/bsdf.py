@@ -2,7 +2,10 @@
 
 The model is Lambert plus one isotropic GGX lobe (height-correlated Smith
 shadowing, single scattering) whose Fresnel term is Schlick's, from `specular`
-to `specular_edge`; both lobes are summed, as UsdPreviewSurface does. Alpha is
+to `specular_edge`. As in USD's own shader of UsdPreviewSurface, a metal keeps
+its colour at grazing angles, and what the interface reflects is missing from
+the diffuse base; that share is taken at normal incidence, so that albedo does
+not depend on the view. Alpha is
 roughness squared, but at least 0.001: narrower lobes are below the precision
 of float32 normals (only a perfectly smooth black or metal surface becomes a
 mirror instead). The cosine to the eye is kept at 1e-4 or more.
@@ -97,7 +100,7 @@ def sample_specular(points: SurfacePoints, to_eye: F32, u: F32) -> tuple[F32, F3
 
 def is_glossy(points: SurfacePoints) -> Bool:
     """(n,) whether a point has a specular lobe that scatters (mirrors and glass have none)."""
-    return (points.specular_edge > 0) & (points.delta == DeltaKind.NONE) & (points.instance >= 0)
+    return np.asarray(points.specular_edge.any(axis=1) | points.specular.any(axis=1)) & (points.delta == DeltaKind.NONE) & (points.instance >= 0)
 
 
 # Cosine-weighted mean over eye directions of the lobe's directional albedo, for `specular` 1 and for
@@ -123,7 +126,7 @@ def effective_albedo(points: SurfacePoints) -> F32:
     roughness = np.maximum(points.roughness.astype(np.float64), 1e-3**0.5)
     base = np.polynomial.polynomial.polyval(roughness, _MEAN_BASE)
     edge = np.polynomial.polynomial.polyval(roughness, _MEAN_EDGE)
-    lobe = points.specular * base[:, None] + (points.specular_edge * edge)[:, None]
+    lobe = points.specular * base[:, None] + points.specular_edge * edge[:, None]
     lobe[~is_glossy(points)] = 0
     return np.ascontiguousarray(np.clip(points.albedo + lobe, 0, 1), np.float32)
 

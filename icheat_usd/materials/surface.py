@@ -22,7 +22,7 @@ def empty_points(n: int) -> SurfacePoints:
         "delta": (np.uint8, ()),
         "barycentric": (np.float32, (2,)),
         "face_uv": (np.float32, (2,)),
-        "specular_edge": (np.float32, ()),
+        "specular_edge": (np.float32, (3,)),
         "roughness": (np.float32, ()),
         "opacity": (np.float32, ()),
         "ior": (np.float32, ()),

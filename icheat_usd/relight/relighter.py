@@ -47,7 +47,7 @@ class Relighter:
     cell_radiance: F32  #: (n_lights, n_gather, 3) the same after all bounces but the last
 
     def radiance(self, gains: F32 | None = None) -> F32:
-        """Light `b` that leaves each gather cell, (n_gather, 3), with each light multiplied by `gains` (n_lights, 3)."""
+        """Light `b` that leaves each gather cell, (n_gather, 3); `gains` (n_lights, 3) multiply the lights."""
         return _weighted_sum(self.cell_radiance, gains)
 
     def receivers(self, field: EditField) -> Receivers:
@@ -119,7 +119,9 @@ class Relighter:
 def _weighted_sum(per_light: F32, gains: F32 | None) -> F32:
     """Sum over lights, in their order, of (n_lights, n, 3) arrays."""
     if gains is not None and gains.shape != (len(per_light), 3):
-        raise SampleSetMismatch(f"gains have shape {gains.shape}, expected one colour for each of {len(per_light)} lights")
+        raise SampleSetMismatch(
+            f"gains have shape {gains.shape}, expected one colour for each of {len(per_light)} lights"
+        )
     total = np.zeros(per_light.shape[1:], np.float32)
     for light, values in enumerate(per_light):
         total += values if gains is None else values * gains[light]

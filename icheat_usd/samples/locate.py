@@ -8,15 +8,22 @@ import numpy as np
 
 from icheat_usd.kernels import locate as kernels
 from icheat_usd.samples.tree import TreeShape
-from icheat_usd.scene import F32, I32, I64, U8
+from icheat_usd.scene import F32, F64, I32, I64, U8
+
+
+#: Mean spacings that a look-up goes out of its way for a sample whose normal agrees.
+DETOUR = 4.0
 
 
 @dataclass(frozen=True)
 class Locator:
     """Nearest gather sample on the same side of the same instance.
 
-    Samples whose normal is within 60 degrees of the place's come first: a thin
-    wall modelled as one closed mesh has both its faces on the front side.
+    Samples whose normal is within 60 degrees of the place's come first, unless
+    they are `DETOUR` mean spacings further away: a thin wall modelled as one
+    closed mesh has both its faces on the front side. Without that bound, a
+    bevel that no sample fell on would search its whole surface (measured: 5.3
+    instead of 0.2 microseconds a look-up in a room made of few meshes).
     Of samples at equal distance the first in tree order is taken. Sides that
     share a cluster find the cluster.
     """
@@ -47,7 +54,9 @@ class Locator:
         return out
 
 
-def build_locator(position: F32, normal: F32, shape: TreeShape, depth: int, slot: I32, slot_begin: I64) -> Locator:
+def build_locator(
+    position: F32, normal: F32, shape: TreeShape, depth: int, slot: I32, slot_begin: I64, slot_area: F64
+) -> Locator:
     """Prepare look-ups among samples.
 
     Parameters
@@ -58,6 +67,8 @@ def build_locator(position: F32, normal: F32, shape: TreeShape, depth: int, slot
         Group of samples of each side, at ``2 * instance + side``.
     slot_begin : (n_groups + 1,)
         Samples of each group, as the tree was built.
+    slot_area : (n_groups,)
+        Square metres that each group's samples stand for.
     """
     position = np.require(position, np.float32, ["C", "W"])
     row = np.empty(len(shape.lo), np.int32)
@@ -73,5 +84,6 @@ def build_locator(position: F32, normal: F32, shape: TreeShape, depth: int, slot
         np.ascontiguousarray(slot, np.int32),
         slot_begin.astype(np.int32),
         slot_record,
+        (DETOUR**2 * slot_area / np.diff(slot_begin)).astype(np.float32),
     )
     return Locator(table, depth)

@@ -1,10 +1,10 @@
 """An open document without a window: what scripts, the shell and user interfaces talk to.
 
-    session = Session.open("shot.usda", camera="/World/Camera", frame=12)
-    session.add_edit("warm", layer="shot.usda", operation="scale", parameters={"color": (1.4, 1.1, 0.8)},
-                     receivers=["/World/Figure"], casters=["/World/Room/Wall"])
-    write_exr(session.relight(), "preview.exr")
-    write_exr(session.render(), "final.exr")
+session = Session.open("shot.usda", camera="/World/Camera", frame=12)
+session.add_edit("warm", layer="shot.usda", operation="scale", parameters={"color": (1.4, 1.1, 0.8)},
+                 receivers=["/World/Figure"], casters=["/World/Room/Wall"])
+write_exr(session.relight(), "preview.exr")
+write_exr(session.render(), "final.exr")
 """
 
 from icheat_usd.edits.painting import soft_sphere

@@ -18,7 +18,7 @@ from icheat_usd.relight import Relighter, build_relighter
 from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
 from icheat_usd.scene import Finding, SceneSnapshot
 from icheat_usd.session import authoring, films
-from icheat_usd.session.quality import Quality
+from icheat_usd.session.quality import FINAL, PREVIEW, Quality
 from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
 from icheat_usd.stage.edit_stack import find_stack, read_edit_stack
@@ -66,7 +66,7 @@ class Session:
         stack: str | None = None,
         width: int | None = None,
         height: int | None = None,
-        quality: Quality = Quality(),
+        quality: Quality = PREVIEW,
         tracer: str = "embree",
         progress: Progress = silent,
     ) -> Session:
@@ -121,16 +121,12 @@ class Session:
     def view(self) -> ViewSamples:
         self.progress("place view samples", 0.0)
         quality = self.quality
-        return view_samples(
-            self.snapshot, self.tracer, samples_per_pixel=quality.samples_per_pixel, seed=quality.seed
-        )
+        return view_samples(self.snapshot, self.tracer, samples_per_pixel=quality.samples_per_pixel, seed=quality.seed)
 
     @cached_property
     def gather(self) -> GatherSamples:
         self.progress("place gather samples", 0.0)
-        return gather_samples(
-            self.snapshot, self.tracer, self.view, n=self.quality.n_gather, seed=self.quality.seed
-        )
+        return gather_samples(self.snapshot, self.tracer, self.view, n=self.quality.n_gather, seed=self.quality.seed)
 
     @cached_property
     def transport(self) -> Transport:
@@ -195,9 +191,11 @@ class Session:
         stack = self.stack
         field = bind(stack, self.snapshot)
         relighter = self.relighter
-        return films.relit_film(self.view, relighter.relight(field), self.metadata("relight", stack, asdict(self.quality)))
+        return films.relit_film(
+            self.view, relighter.relight(field), self.metadata("relight", stack, asdict(self.quality))
+        )
 
-    def render(self, settings: GatherSettings = GatherSettings()) -> Film:
+    def render(self, settings: GatherSettings = FINAL) -> Film:
         """Final frame by gathering at every camera sample; same layers as `relight`."""
         stack = self.stack
         field = bind(stack, self.snapshot)

@@ -1,8 +1,10 @@
-"""How much work goes into a preview."""
+"""How much work goes into an image."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+from icheat_usd.final_gather import GatherSettings
 
 
 @dataclass(frozen=True)
@@ -22,4 +24,8 @@ class Quality:
     seed: int = 0
 
 
+#: Seconds rather than a minute: for a first look, and for tests.
 DRAFT = Quality(n_gather=8_192, rays_per_row=64, rays_per_bounce_row=64, row_spacing=4, light_samples=8)
+
+PREVIEW = Quality()
+FINAL = GatherSettings()

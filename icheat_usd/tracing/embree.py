@@ -11,9 +11,11 @@ scene                      copies 16 / 1      instances 16 / 1     shadow 16 / 1
 =========================  =================  ===================  ==================
 
 (shadow: with instances.) So meshes placed repeatedly are instances, which also build ten times as fast; packets of 16
-are traced in scenes of few instances, single rays in scenes of many. embreex's own interface reached 2.6 million rays
-per second with two Python threads where these calls reached 2.8, on a closed mesh of 156,000 triangles, without
-instances or shadow-ray limits.
+are traced in scenes of few instances, single rays in scenes of many.
+
+embreex's own interface against these calls, same rays, one thread: 10.5 and 13.0 for nearest hits in a room of 143,000
+triangles, 17 and 26 for occlusion; equal (1.7 and 2.1) inside a bumpy sphere of 156,000, where traversal is all. The
+interface also holds on to Python between blocks of rays, knows no `t_max` and returns no instances.
 """
 
 from __future__ import annotations

@@ -117,8 +117,7 @@ def build_transport(
     if len(glossy):
         base, edge = builder.specular_rows(points, view.to_eye[row_view], stream, glossy, rays_per_row, progress)
         lobes.append(Lobe("specular_base", base, view.points.specular))
-        edge_tint = np.repeat(view.points.specular_edge[:, None], 3, axis=1)
-        lobes.append(Lobe("specular_edge", edge, edge_tint))
+        lobes.append(Lobe("specular_edge", edge, view.points.specular_edge))
 
     bounce = builder.diffuse_rows(
         gather.patch_points,

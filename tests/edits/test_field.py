@@ -63,7 +63,11 @@ STACKS = {
         bound(Paint()),
         bound(find("scale"), {"gain": 0.5}, amount=0.9),
     ],
-    "over replaces": [bound(find("scale"), {"gain": 4.0}), bound(Paint()), bound(find("hsv"), {"hue": 20.0}, blend=Blend.OVER)],
+    "over replaces": [
+        bound(find("scale"), {"gain": 4.0}),
+        bound(Paint()),
+        bound(find("hsv"), {"hue": 20.0}, blend=Blend.OVER),
+    ],
     "add sums": [bound(find("hsv"), {"hue": 200.0}), bound(find("scale"), {"gain": 4.0}, blend=Blend.ADD)],
     "two keys": [bound(find("hsv"), {"hue": 40.0}, key_weights=(0.25, 0.75)), bound(find("scale"), {"gain": 2.0})],
 }
@@ -94,7 +98,9 @@ def test_pairs_outside_the_masks_keep_exactly_the_identity():
 def test_full_over_hides_the_weaker_edits():
     strong = bound(find("scale"), {"gain": 4.0}, blend=Blend.OVER)
     b, u, w = random_pairs(50, 1)
-    both = EditField((bound(find("hsv"), {"hue": 90.0}), strong)).evaluate(b, np.ones((2, 50), np.float32), np.ones((2, 50), np.float32))
+    both = EditField((bound(find("hsv"), {"hue": 90.0}), strong)).evaluate(
+        b, np.ones((2, 50), np.float32), np.ones((2, 50), np.float32)
+    )
     alone = EditField((strong,)).evaluate(b, np.ones((1, 50), np.float32), np.ones((1, 50), np.float32))
     np.testing.assert_allclose(both.scale, alone.scale, atol=1e-6)
     np.testing.assert_allclose(both.emission, alone.emission, atol=1e-6)

@@ -19,7 +19,7 @@ def receivers(
     shading_normal: ArrayLike | None = None,
     albedo: ArrayLike = 0.5,
     specular: ArrayLike = 0.0,
-    specular_edge: float = 0.0,
+    specular_edge: ArrayLike = 0.0,
     roughness: float = 0.5,
 ) -> SurfacePoints:
     """Free-floating opaque surface points; the instance 0 they name need not be there."""
@@ -46,7 +46,7 @@ def receivers(
         face_uv=np.zeros((n, 2), np.float32),
         albedo=rows(albedo),
         specular=rows(specular),
-        specular_edge=column(specular_edge),
+        specular_edge=rows(specular_edge),
         roughness=column(roughness),
         emission=rows(0.0),
         delta=np.zeros(n, np.uint8),

@@ -221,6 +221,7 @@ def test_reflected_light_has_the_same_bits_for_any_number_of_threads_and_any_chu
     points = glossy(0.3, 150)
     points.position[:, 0] = np.linspace(-1, 1, 150)
     points.specular_edge[::3] = 0.0
+    points.specular[::3] = 0.0
     before = numba.get_num_threads()
     together = reflected_at(snapshot, points, n_samples=8)
     try:

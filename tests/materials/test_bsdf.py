@@ -82,7 +82,7 @@ def test_the_linear_parts_add_up_to_the_whole() -> None:
     parts = evaluate_specular(points, eye, directions)
     cosine = directions @ TILT[:, 1]
     whole = points.albedo * (cosine / np.pi)[:, None] + points.specular * parts.base[:, None]
-    whole += (points.specular_edge * parts.edge)[:, None]
+    whole += points.specular_edge * parts.edge[:, None]
     np.testing.assert_allclose(evaluate(points, eye, directions), whole, rtol=1e-5)
 
 
@@ -214,8 +214,11 @@ def test_inside_glass_the_way_out_is_the_way_in_reversed_or_totally_reflected() 
 def test_mirrors_holes_and_translucent_surfaces_split_without_glass() -> None:
     incoming = many(-at_angle(0.7), 1)
     mirror = dielectric_split(points_of(Material((0.9, 0.5, 0.1), metallic=1.0, roughness=0.0), 1), incoming)
+    np.testing.assert_allclose(mirror.weight_reflected[0], (0.9, 0.5, 0.1), rtol=1e-5)
+    black = Material(0.0, specular=(0.9, 0.5, 0.1), use_specular=True, roughness=0.0)
+    edge = dielectric_split(points_of(black, 1), incoming)
     schlick = f32([0.9, 0.5, 0.1]) + (1 - f32([0.9, 0.5, 0.1])) * (1 - np.cos(0.7)) ** 5
-    np.testing.assert_allclose(mirror.weight_reflected[0], schlick, rtol=1e-5)
+    np.testing.assert_allclose(edge.weight_reflected[0], schlick, rtol=1e-5)
     np.testing.assert_allclose(mirror.reflected[0], at_angle(0.7, 0.4 + np.pi), atol=1e-6)
     assert not mirror.weight_refracted.any()
     hole = dielectric_split(points_of(Material(opacity=0.1, opacity_threshold=0.5), 1), incoming)

@@ -170,8 +170,8 @@ def test_texture_transform_scale_bias_and_channel_are_applied() -> None:
 def test_a_dielectric_has_the_fresnel_reflectance_of_its_index() -> None:
     point = material_point(Material(diffuse=(0.2, 0.4, 0.6), ior=1.5))
     np.testing.assert_allclose(point.specular[0], 0.04, rtol=1e-6)
-    np.testing.assert_allclose(point.albedo[0], (0.2, 0.4, 0.6))
-    assert point.specular_edge[0] == 1 and point.delta[0] == DeltaKind.NONE
+    np.testing.assert_allclose(point.albedo[0], 0.96 * f32([0.2, 0.4, 0.6]), rtol=1e-6)
+    assert (point.specular_edge[0] == 1).all() and point.delta[0] == DeltaKind.NONE
 
 
 def test_index_one_is_no_interface() -> None:
@@ -182,14 +182,15 @@ def test_index_one_is_no_interface() -> None:
 def test_metalness_moves_the_colour_from_diffuse_to_specular() -> None:
     colour = f32([0.9, 0.6, 0.3])
     point = material_point(Material(diffuse=colour, metallic=0.25, ior=1.5))
-    np.testing.assert_allclose(point.albedo[0], 0.75 * colour, rtol=1e-6)
     np.testing.assert_allclose(point.specular[0], 0.75 * 0.04 + 0.25 * colour, rtol=1e-6)
+    np.testing.assert_allclose(point.specular_edge[0], 0.75 + 0.25 * colour, rtol=1e-6)
+    np.testing.assert_allclose(point.albedo[0], 0.75 * colour * (1 - point.specular[0]), rtol=1e-6)
 
 
 def test_the_specular_workflow_takes_its_colour_as_given() -> None:
     point = material_point(Material(0.3, specular=(0.1, 0.2, 0.3), use_specular=True, metallic=1.0, ior=1.5))
     np.testing.assert_allclose(point.specular[0], (0.1, 0.2, 0.3))
-    np.testing.assert_allclose(point.albedo[0], 0.3)
+    np.testing.assert_allclose(point.albedo[0], 0.3 * (1 - point.specular[0]), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

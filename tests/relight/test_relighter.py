@@ -47,13 +47,26 @@ def painted(operation: str, parameters: Mapping[str, Value], receivers, casters,
 def stacks(pipeline: Pipeline) -> dict[str, tuple[Edit, ...]]:
     floor, walls = select("/floor"), select("/red", "/green")
     warm = Edit("/warm", "scale", {"color": (2.0, 1.0, 0.5)}, floor, walls)
-    turn = Edit("/turn", "hsv", {"hue": 120.0, "saturation": 0.8, "value": 1.5}, select("/floor", "/low"), EVERYTHING, amount=0.6)
+    turn = Edit(
+        "/turn",
+        "hsv",
+        {"hue": 120.0, "saturation": 0.8, "value": 1.5},
+        select("/floor", "/low"),
+        EVERYTHING,
+        amount=0.6,
+    )
     return {
         "scale between objects": (warm,),
         "hsv over scale": (warm, turn),
         "scale over hsv": (turn, warm),
-        "soft receivers": (painted("scale", {"gain": 3.0}, floor, walls, receiver_mask=soft_mask(pipeline, "/floor")), turn),
-        "soft casters": (turn, painted("hsv", {"hue": 50.0}, floor, select("/red"), caster_mask=soft_mask(pipeline, "/red", 1))),
+        "soft receivers": (
+            painted("scale", {"gain": 3.0}, floor, walls, receiver_mask=soft_mask(pipeline, "/floor")),
+            turn,
+        ),
+        "soft casters": (
+            turn,
+            painted("hsv", {"hue": 50.0}, floor, select("/red"), caster_mask=soft_mask(pipeline, "/red", 1)),
+        ),
         "over": (warm, Edit("/o", "scale", {"gain": 0.2}, floor, EVERYTHING, amount=0.5, blend=Blend.OVER)),
         "add": (warm, Edit("/a", "hsv", {"hue": 90.0}, floor, EVERYTHING, blend=Blend.ADD)),
     }
@@ -135,7 +148,9 @@ def test_no_edit_muted_edit_and_amount_zero_are_the_unedited_image_bit_for_bit(s
 
 def test_samples_outside_the_receivers_keep_their_bits_and_those_inside_change(small):
     light = small.relight(Edit("/e", "hsv", {"value": 3.0}, select("/floor"), EVERYTHING))
-    on_floor = small.field(Edit("/e", "scale", {}, select("/floor"), EVERYTHING)).receiver_masks(small.view.points)[0] > 0
+    on_floor = (
+        small.field(Edit("/e", "scale", {}, select("/floor"), EVERYTHING)).receiver_masks(small.view.points)[0] > 0
+    )
     np.testing.assert_array_equal(light.indirect_edited[~on_floor], light.indirect[~on_floor])
     assert on_floor.sum() > 5
     np.testing.assert_allclose(light.indirect_edited[on_floor], 3 * light.indirect[on_floor], rtol=1e-4)
@@ -158,7 +173,8 @@ def test_lights_add_up_and_gains_scale_them():
     pipeline = Pipeline(both, n_gather=200, rays=64, bounce_rays=64, n_bounces=6)
     field = pipeline.field()
     first, second = (
-        pipeline.relighter.relight(field, np.array(gains, np.float32)) for gains in ([[1] * 3, [0] * 3], [[0] * 3, [1] * 3])
+        pipeline.relighter.relight(field, np.array(gains, np.float32))
+        for gains in ([[1] * 3, [0] * 3], [[0] * 3, [1] * 3])
     )
     np.testing.assert_allclose(first.indirect + second.indirect, pipeline.relight().indirect, rtol=1e-5)
     doubled = pipeline.relighter.relight(field, np.array([[2] * 3, [0] * 3], np.float32))
