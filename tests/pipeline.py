@@ -15,7 +15,7 @@ from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_
 from icheat_usd.samples.develop import develop
 from icheat_usd.scene import F64, SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
-from icheat_usd.transport import Transport, build_transport
+from icheat_usd.transport import Bounces, CellLight, Transport, build_bounces, build_transport, light_cells
 
 
 @dataclass
@@ -29,6 +29,7 @@ class Pipeline:
     light_samples: int = 64
     n_bounces: int = 24
     row_spacing: int = 1
+    samples_per_pixel: int = 1
     seed: int = 0
     engine: str = "embree"
 
@@ -38,7 +39,7 @@ class Pipeline:
 
     @cached_property
     def view(self) -> ViewSamples:
-        return view_samples(self.snapshot, self.tracer, seed=self.seed)
+        return view_samples(self.snapshot, self.tracer, samples_per_pixel=self.samples_per_pixel, seed=self.seed)
 
     @cached_property
     def gather(self) -> GatherSamples:
@@ -52,8 +53,23 @@ class Pipeline:
             self.view,
             self.gather,
             rays_per_row=self.rays,
-            rays_per_bounce_row=self.bounce_rays,
             row_spacing=self.row_spacing,
+            seed=self.seed,
+        )
+
+    @cached_property
+    def bounces(self) -> Bounces:
+        return build_bounces(self.snapshot, self.tracer, self.gather, rays_per_row=self.bounce_rays, seed=self.seed)
+
+    @cached_property
+    def cell_light(self) -> CellLight:
+        return light_cells(
+            self.snapshot,
+            self.tracer,
+            self.gather,
+            self.bounces,
+            n_bounces=self.n_bounces,
+            light_samples=self.light_samples,
             seed=self.seed,
         )
 
@@ -65,7 +81,7 @@ class Pipeline:
             self.view,
             self.gather,
             self.transport,
-            n_bounces=self.n_bounces,
+            self.cell_light,
             light_samples=self.light_samples,
             seed=self.seed,
         )
@@ -79,7 +95,9 @@ class Pipeline:
     def image(self, radiance: np.ndarray) -> F64:
         return develop(self.view, radiance).reshape(self.view.height, self.view.width, 3)
 
-    def final(self, *edits: Edit, samples: int = 4, rays: int = 256, light_samples: int = 16, seed: int = 0) -> FinalGather:
+    def final(
+        self, *edits: Edit, samples: int = 4, rays: int = 256, light_samples: int = 16, seed: int = 0
+    ) -> FinalGather:
         settings = GatherSettings(samples, rays, light_samples, self.n_bounces, seed)
         field = self.field(*edits)
         needs = field.uses_incident or field.has_offset
@@ -89,7 +107,7 @@ class Pipeline:
             field,
             settings=settings,
             gather=self.gather if needs else None,
-            gather_radiance=self.relighter.radiance() if needs else None,
+            gather_radiance=self.cell_light.total() if needs else None,
         )
 
 

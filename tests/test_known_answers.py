@@ -92,7 +92,7 @@ def test_form_factors_of_plates_are_the_row_sums():
         camera = look_at((0, 0.4, 0), (0, 0, 0), up=(0, 0, -1), fov=102.6803, width=32, height=32)
         pipeline = Pipeline(make_snapshot(meshes, camera=camera), n_gather=512, rays=1024, bounce_rays=2048)
         on_low = pipeline.gather.points.instance == 0
-        towards_high = pipeline.transport.bounce.matmul((~on_low).astype(np.float32)[:, None])[:, 0]
+        towards_high = pipeline.bounces.rows.matmul((~on_low).astype(np.float32)[:, None])[:, 0]
         facing = on_low & (pipeline.gather.points.normal[:, 1] > 0.5)
         area = pipeline.gather.area[facing]
         found = (towards_high[facing] * area).sum() / area.sum()
@@ -105,7 +105,7 @@ def test_rows_of_a_closed_room_sum_to_one():
     points = pipeline.gather.points
     inside = np.einsum("ij,ij->i", points.normal, points.position) < 0
     assert inside.sum() > 500
-    np.testing.assert_allclose(pipeline.transport.bounce.row_sums()[inside], 1, atol=1e-5)
+    np.testing.assert_allclose(pipeline.bounces.rows.row_sums()[inside], 1, atol=1e-5)
 
 
 def lit_room(scale: float = 1.0):

@@ -8,7 +8,7 @@ from icheat_usd.kernels.gather import uniforms
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.samples import cosine_rays
 from icheat_usd.lighting import LightSampler, irradiance
-from icheat_usd.materials import effective_albedo, take_points
+from icheat_usd.materials import effective_albedo, nonzero_rows, take_points
 from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
@@ -43,7 +43,7 @@ def trace_hemisphere(
         directions,
     )
     ends = first_surfaces(snapshot, tracer, origins, directions, int(hash_combine(seed, 1)))
-    return ends.points, ends.throughput
+    return ends.points, ends.throughput * (ends.points.instance >= 0)[:, None]
 
 
 def reflected_radiance(
@@ -73,8 +73,8 @@ def reflected_radiance(
     (n, 3) float32, radiance, scene-linear
     """
     result = np.zeros_like(throughput)
-    alive = np.flatnonzero(throughput.any(axis=1))
-    carried = throughput[alive]
+    alive = np.flatnonzero(nonzero_rows(throughput))
+    carried = np.take(throughput, alive, axis=0)
     points = take_points(points, alive)
     for bounce in range(n_bounces):
         if len(alive) == 0:
@@ -87,14 +87,15 @@ def reflected_radiance(
             break
         carried = carried * albedo
         # Survival by the reflectance of this vertex alone: the paths that carry most light live longest.
-        survival = np.clip(albedo.max(axis=1), np.float32(0.05), np.float32(0.95))
+        largest = np.maximum(np.maximum(albedo[:, 0], albedo[:, 1]), albedo[:, 2])
+        survival = np.clip(largest, np.float32(0.05), np.float32(0.95))
         chance = np.empty(len(alive), np.float32)
         uniforms(step_seed, alive, chance)
         lives = np.flatnonzero(chance < survival)
         alive, points = alive[lives], take_points(points, lives)
-        carried = carried[lives] / survival[lives, None]
+        carried = np.take(carried, lives, axis=0) / survival[lives, None]
         points, through = trace_hemisphere(snapshot, tracer, points, alive, 1, int(hash_combine(step_seed, 2)))
         carried = carried * through
-        lives = np.flatnonzero(carried.any(axis=1))
-        alive, carried, points = alive[lives], carried[lives], take_points(points, lives)
+        lives = np.flatnonzero(nonzero_rows(carried))
+        alive, carried, points = alive[lives], np.take(carried, lives, axis=0), take_points(points, lives)
     return result

@@ -13,6 +13,7 @@ from icheat_usd.materials.bsdf import (
 from icheat_usd.materials.surface import (
     concatenate_points,
     empty_points,
+    nonzero_rows,
     points_on_surface,
     shade_hits,
     take_points,
@@ -28,6 +29,7 @@ __all__ = [
     "evaluate",
     "evaluate_specular",
     "is_glossy",
+    "nonzero_rows",
     "points_on_surface",
     "sample_specular",
     "shade_hits",

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from icheat_usd.materials.surface import nonzero_rows
 from icheat_usd.scene import F32, Bool, DeltaKind, SurfacePoints
 
 
@@ -100,7 +101,8 @@ def sample_specular(points: SurfacePoints, to_eye: F32, u: F32) -> tuple[F32, F3
 
 def is_glossy(points: SurfacePoints) -> Bool:
     """(n,) whether a point has a specular lobe that scatters (mirrors and glass have none)."""
-    return np.asarray(points.specular_edge.any(axis=1) | points.specular.any(axis=1)) & (points.delta == DeltaKind.NONE) & (points.instance >= 0)
+    lobe = nonzero_rows(points.specular_edge) | nonzero_rows(points.specular)
+    return lobe & (points.delta == DeltaKind.NONE) & (points.instance >= 0)
 
 
 # Cosine-weighted mean over eye directions of the lobe's directional albedo, for `specular` 1 and for
@@ -123,12 +125,14 @@ def effective_albedo(points: SurfacePoints) -> F32:
     (n, 3) float32
         Equal to `albedo` where there is no interface; 0 at mirrors, glass and holes, which hand light on as deltas.
     """
-    roughness = np.maximum(points.roughness.astype(np.float64), 1e-3**0.5)
+    result = points.albedo.copy()
+    glossy = np.flatnonzero(is_glossy(points))
+    roughness = np.maximum(points.roughness[glossy].astype(np.float64), 1e-3**0.5)
     base = np.polynomial.polynomial.polyval(roughness, _MEAN_BASE)
     edge = np.polynomial.polynomial.polyval(roughness, _MEAN_EDGE)
-    lobe = points.specular * base[:, None] + points.specular_edge * edge[:, None]
-    lobe[~is_glossy(points)] = 0
-    return np.ascontiguousarray(np.clip(points.albedo + lobe, 0, 1), np.float32)
+    lobe = points.specular[glossy] * base[:, None] + points.specular_edge[glossy] * edge[:, None]
+    result[glossy] = np.clip(result[glossy] + lobe, 0, 1)
+    return result
 
 
 class DeltaSplit(NamedTuple):

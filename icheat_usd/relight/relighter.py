@@ -14,10 +14,10 @@ from icheat_usd.kernels.relight import multiply_rows
 from icheat_usd.lighting import build_light_sampler, reflected_direct
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight.receivers import Receivers, group_receivers
-from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct
+from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
-from icheat_usd.transport import SparseRows, Transport, solve_bounces
+from icheat_usd.transport import CellLight, SparseRows, Transport, sum_lights
 
 #: View samples evaluated pair by pair at once; bounds the memory of a relight.
 SAMPLES_AT_ONCE = 4096
@@ -43,12 +43,11 @@ class Relighter:
     gather: GatherSamples
     transport: Transport
     view_direct: F32  #: (n_lights, n_view, 3) reflected direct light
-    cell_direct: F32  #: (n_lights, n_gather, 3) reflected direct light of the gather cells
-    cell_radiance: F32  #: (n_lights, n_gather, 3) the same after all bounces but the last
+    cell_light: CellLight
 
     def radiance(self, gains: F32 | None = None) -> F32:
         """Light `b` that leaves each gather cell, (n_gather, 3); `gains` (n_lights, 3) multiply the lights."""
-        return _weighted_sum(self.cell_radiance, gains)
+        return _weighted_sum(self.cell_light.radiance, gains)
 
     def receivers(self, field: EditField) -> Receivers:
         """What `relight` needs to know about where the edits land; keep it while only amounts or lights change."""
@@ -122,10 +121,7 @@ def _weighted_sum(per_light: F32, gains: F32 | None) -> F32:
         raise SampleSetMismatch(
             f"gains have shape {gains.shape}, expected one colour for each of {len(per_light)} lights"
         )
-    total = np.zeros(per_light.shape[1:], np.float32)
-    for light, values in enumerate(per_light):
-        total += values if gains is None else values * gains[light]
-    return total
+    return sum_lights(per_light if gains is None else per_light * gains[:, None, :])
 
 
 def _rows_at(rows: SparseRows, interpolation: SparseRows | None, samples: I64, b: F32) -> F32:
@@ -174,27 +170,21 @@ def build_relighter(
     view: ViewSamples,
     gather: GatherSamples,
     transport: Transport,
+    cell_light: CellLight,
     *,
-    n_bounces: int = 16,
     light_samples: int = 16,
     seed: int = 0,
     progress: Progress = silent,
 ) -> Relighter:
-    """Light the samples and solve the bounces between them.
+    """Light the view samples and put the parts together.
 
     Parameters
     ----------
-    n_bounces : int
-        Diffuse reflections before the last one; 1 is direct light once reflected.
     light_samples : int
-        Shadow rays per light and point.
+        Shadow rays per light and view sample.
     """
-    sampler = build_light_sampler(snapshot)
     progress("light the view samples", 0.0)
-    view_direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, light_samples)
-    progress("light the gather samples", 0.0)
-    direct = cell_direct(snapshot, tracer, sampler, gather, light_samples, seed)
-    progress("solve the bounces", 0.0)
-    solved = solve_bounces(transport, direct, n_bounces)
-    progress("solve the bounces", 1.0)
-    return Relighter(view, gather, transport, view_direct, direct, solved)
+    sampler = build_light_sampler(snapshot)
+    direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, light_samples)
+    progress("light the view samples", 1.0)
+    return Relighter(view, gather, transport, direct, cell_light)

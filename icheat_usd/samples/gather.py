@@ -107,7 +107,9 @@ def gather_samples(
     points = _spread(snapshot, area, slots, slots.count, seed, 1)
     shape = split_samples(slots.names, slot_begin, points.position, points.normal)
     points = take_points(points, shape.order)
-    locator = build_locator(points.position, points.normal, shape, _depth_bound(n), slots.of_side, slot_begin, slots.area)
+    locator = build_locator(
+        points.position, points.normal, shape, _depth_bound(n), slots.of_side, slot_begin, slots.area
+    )
 
     patches = _spread(snapshot, area, slots, slots.count * n_patches_per_cell, seed, 2)
     cell = locator.locate(patches.position, patches.normal, patches.instance, patches.side)

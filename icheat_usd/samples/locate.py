@@ -10,7 +10,6 @@ from icheat_usd.kernels import locate as kernels
 from icheat_usd.samples.tree import TreeShape
 from icheat_usd.scene import F32, F64, I32, I64, U8
 
-
 #: Mean spacings that a look-up goes out of its way for a sample whose normal agrees.
 DETOUR = 4.0
 

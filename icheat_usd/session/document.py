@@ -11,6 +11,7 @@ from typing import Any
 from icheat_usd.edits.field import bind
 from icheat_usd.edits.model import EMPTY_STACK, Blend, EditStack, SurfaceMask, Value
 from icheat_usd.edits.painting import Brush, paint_mask
+from icheat_usd.errors import StageError
 from icheat_usd.final_gather import GatherSettings, final_gather
 from icheat_usd.image.film import Film
 from icheat_usd.progress import Progress, silent
@@ -23,7 +24,7 @@ from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
 from icheat_usd.stage.edit_stack import find_stack, read_edit_stack
 from icheat_usd.tracing import Tracer, build_tracer
-from icheat_usd.transport import Transport, build_transport
+from icheat_usd.transport import CellLight, Transport, build_bounces, build_transport, light_cells
 
 
 class Session:
@@ -109,9 +110,16 @@ class Session:
     def snapshot(self) -> SceneSnapshot:
         """The stage at the session's frame."""
         width, height = self._size
-        return take_snapshot(
+        snapshot = take_snapshot(
             self.stage, camera=self.camera, time=self.frame, width=width, height=height, progress=self.progress
         )
+        if len(snapshot.geometry.face) == 0:
+            reasons = "; ".join(f"{f.prim}: {f.message}" for f in snapshot.findings[:3])
+            raise StageError(
+                f"{snapshot.stage_path} shows no surface at this frame, so there is nothing to light;"
+                f" check visibility, purpose and the frame{' (' + reasons + ')' if reasons else ''}"
+            )
+        return snapshot
 
     @cached_property
     def tracer(self) -> Tracer:
@@ -137,8 +145,30 @@ class Session:
             self.view,
             self.gather,
             rays_per_row=quality.rays_per_row,
-            rays_per_bounce_row=quality.rays_per_bounce_row,
             row_spacing=quality.row_spacing,
+            seed=quality.seed,
+            progress=self.progress,
+        )
+
+    @cached_property
+    def cell_light(self) -> CellLight:
+        """Light that leaves the gather samples, of all bounces but the last."""
+        quality = self.quality
+        bounces = build_bounces(
+            self.snapshot,
+            self.tracer,
+            self.gather,
+            rays_per_row=quality.rays_per_bounce_row,
+            seed=quality.seed,
+            progress=self.progress,
+        )
+        return light_cells(
+            self.snapshot,
+            self.tracer,
+            self.gather,
+            bounces,
+            n_bounces=quality.n_bounces,
+            light_samples=quality.light_samples,
             seed=quality.seed,
             progress=self.progress,
         )
@@ -152,7 +182,7 @@ class Session:
             self.view,
             self.gather,
             self.transport,
-            n_bounces=quality.n_bounces,
+            self.cell_light,
             light_samples=quality.light_samples,
             seed=quality.seed,
             progress=self.progress,
@@ -201,7 +231,7 @@ class Session:
         field = bind(stack, self.snapshot)
         gather, radiance = None, None
         if field.uses_incident or field.has_offset:
-            gather, radiance = self.gather, self.relighter.radiance()
+            gather, radiance = self.gather, self.cell_light.total()
         result = final_gather(
             self.snapshot,
             self.tracer,

@@ -199,9 +199,10 @@ def test_missing_damaged_and_foreign_payloads_are_named(shot):
         (None, "missing.usda"),
         ("not usd", "broken.usda"),
         ('#usda 1.0\ndef Xform "World" {}\n', "camera"),
+        ('#usda 1.0\ndef Camera "Camera" {}\n', "nothing to light"),
         (ROOM.replace('def Camera "Camera"', 'def Camera "Other" {}\n    def Camera "Camera"'), "/World/Other"),
     ],
-    ids=["missing", "not USD", "no camera", "two cameras"],
+    ids=["missing", "not USD", "no camera", "empty", "two cameras"],
 )
 def test_unusable_stages_give_one_clear_error(tmp_path, content, complaint):
     path = tmp_path / ("missing.usda" if content is None else "broken.usda")
@@ -209,11 +210,3 @@ def test_unusable_stages_give_one_clear_error(tmp_path, content, complaint):
         path.write_text(content)
     with pytest.raises(StageError, match=complaint):
         Session.open(path, quality=DRAFT).relight()
-
-
-def test_a_stage_without_geometry_is_black_but_for_its_dome(tmp_path):
-    path = tmp_path / "empty.usda"
-    path.write_text('#usda 1.0\ndef Camera "Camera" {}\ndef DomeLight "Dome" {\nfloat inputs:intensity = 2\n}\n')
-    film = Session.open(path, width=8, height=6, quality=DRAFT).relight()
-    np.testing.assert_allclose(film.layer("beauty"), 2, rtol=1e-5)
-    assert (film.layer("indirect") == 0).all()

@@ -10,7 +10,7 @@ from icheat_usd.lighting import build_light_sampler
 from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct, gather_samples, view_samples
 from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
-from icheat_usd.transport import Transport, build_transport, solve_bounces
+from icheat_usd.transport import Bounces, Transport, build_bounces, build_transport, solve_bounces
 from tests.scenes import (
     Light,
     Material,
@@ -35,36 +35,33 @@ def prepare(scene: SceneSnapshot, n: int) -> tuple[Tracer, ViewSamples, GatherSa
 
 def transport_of(
     scene: SceneSnapshot, n: int, rays: int, **options: int
-) -> tuple[ViewSamples, GatherSamples, Transport]:
+) -> tuple[ViewSamples, GatherSamples, Transport, Bounces]:
     tracer, view, gather = prepare(scene, n)
-    return (
-        view,
-        gather,
-        build_transport(scene, tracer, view, gather, rays_per_row=rays, rays_per_bounce_row=rays, **options),
-    )
+    transport = build_transport(scene, tracer, view, gather, rays_per_row=rays, **options)
+    return view, gather, transport, build_bounces(scene, tracer, gather, rays_per_row=rays)
 
 
-def side_factors(gather: GatherSamples, transport: Transport, receiver: int, caster: int) -> tuple[float, F32]:
+def side_factors(gather: GatherSamples, bounces: Bounces, receiver: int, caster: int) -> tuple[float, F32]:
     """Form factor from one side (2 * instance + side) to another: area mean of bounce rows, and its parts."""
     key = 2 * gather.points.instance + gather.points.side
-    seen = transport.bounce.matmul((key == caster).astype(np.float32)[:, None])[key == receiver, 0]
+    seen = bounces.rows.matmul((key == caster).astype(np.float32)[:, None])[key == receiver, 0]
     return float(np.average(seen, weights=gather.area[key == receiver])), seen
 
 
 def test_every_ray_in_a_closed_room_lands_in_a_cell() -> None:
-    _, gather, transport = transport_of(closed_box(), 300, 64)
+    _, gather, transport, bounces = transport_of(closed_box(), 300, 64)
     np.testing.assert_allclose(transport.lobes[0].rows.row_sums(), 1, rtol=1e-6)
     inside = gather.points.side == 0
-    np.testing.assert_allclose(transport.bounce.row_sums()[inside], 1, rtol=1e-6)
-    assert np.all(transport.bounce.row_sums()[~inside] == 0)
+    np.testing.assert_allclose(bounces.rows.row_sums()[inside], 1, rtol=1e-6)
+    assert np.all(bounces.rows.row_sums()[~inside] == 0)
     assert len(transport.lobes) == 1
 
 
 def test_parallel_unit_squares_one_apart_see_a_fifth_of_each_other() -> None:
     lower, upper = Mesh(quad(1)), Mesh(quad(1), transforms=[translation(0, 1, 0) @ rotation((1, 0, 0), 180)])
     scene = make_snapshot([lower, upper], camera=look_at((0, 0.5, 2.5)))
-    _, gather, transport = transport_of(scene, 400, 256)
-    factor, parts = side_factors(gather, transport, 0, 2)
+    _, gather, transport, bounces = transport_of(scene, 400, 256)
+    factor, parts = side_factors(gather, bounces, 0, 2)
     # Howell, A Catalog of Radiation Heat Transfer Configuration Factors, C-11: side 1, distance 1.
     expected = 0.199825
     sigma = np.sqrt(expected * (1 - expected) / (256 * len(parts)))
@@ -74,8 +71,8 @@ def test_parallel_unit_squares_one_apart_see_a_fifth_of_each_other() -> None:
 def test_squares_that_share_an_edge_at_a_right_angle_see_a_fifth_of_each_other() -> None:
     wall = translation(0, 0.5, -0.5) @ rotation((1, 0, 0), 90)
     scene = make_snapshot([Mesh(quad(1)), Mesh(quad(1), transforms=[wall])], camera=look_at((0.3, 1, 2)))
-    _, gather, transport = transport_of(scene, 400, 256)
-    factor, parts = side_factors(gather, transport, 0, 2)
+    _, gather, transport, bounces = transport_of(scene, 400, 256)
+    factor, parts = side_factors(gather, bounces, 0, 2)
     expected = 0.200044  # Howell, C-14: equal squares with a common edge
     sigma = np.sqrt(expected * (1 - expected) / (256 * len(parts)))
     assert abs(factor - expected) < 3 * sigma
@@ -84,9 +81,9 @@ def test_squares_that_share_an_edge_at_a_right_angle_see_a_fifth_of_each_other()
 def test_areas_times_form_factors_are_the_same_both_ways() -> None:
     wall = translation(0.2, 0.8, -0.6) @ rotation((1, 0, 0), 70)
     scene = make_snapshot([Mesh(quad(1)), Mesh(quad(1.7), transforms=[wall])], camera=look_at((0.3, 1, 2)))
-    _, gather, transport = transport_of(scene, 500, 256)
-    there, parts = side_factors(gather, transport, 0, 2)
-    back, parts_back = side_factors(gather, transport, 2, 0)
+    _, gather, transport, bounces = transport_of(scene, 500, 256)
+    there, parts = side_factors(gather, bounces, 0, 2)
+    back, parts_back = side_factors(gather, bounces, 2, 0)
     sigma = 1 / np.sqrt(256 * min(len(parts), len(parts_back)))
     assert abs(1.0 * there - 1.7**2 * back) < 3 * sigma
     assert there > 0.1
@@ -98,9 +95,9 @@ def test_every_part_of_a_closed_sphere_sees_every_other_alike() -> None:
     tracer = build_tracer(scene)
     view = view_samples(scene, tracer)
     gather = gather_samples(scene, tracer, view, n=60, n_patches_per_cell=300)
-    transport = build_transport(scene, tracer, view, gather, rays_per_row=1, rays_per_bounce_row=4096)
+    bounces = build_bounces(scene, tracer, gather, rays_per_row=4096)
     inside = np.flatnonzero(gather.points.side == 0)
-    dense = transport.bounce.matmul(np.eye(gather.n, dtype=np.float32))[np.ix_(inside, inside)]
+    dense = bounces.rows.matmul(np.eye(gather.n, dtype=np.float32))[np.ix_(inside, inside)]
     share = gather.area[inside] / gather.area[inside].sum()
     # Flat facets bend the sphere's law for the nearest ones: a cell sees a little more of itself.
     others = ~np.eye(len(inside), dtype=bool)
@@ -113,18 +110,19 @@ def test_every_part_of_a_closed_sphere_sees_every_other_alike() -> None:
 def test_light_in_a_closed_glowing_room_adds_up_to_the_geometric_series(albedo: float) -> None:
     scene = closed_box(albedo, emission=1.0)
     tracer, view, gather = prepare(scene, 200)
-    transport = build_transport(scene, tracer, view, gather, rays_per_row=64, rays_per_bounce_row=64)
+    transport = build_transport(scene, tracer, view, gather, rays_per_row=64)
+    bounces = build_bounces(scene, tracer, gather, rays_per_row=64)
     direct = cell_direct(scene, tracer, build_light_sampler(scene), gather, 256, 0)
-    total = solve_bounces(transport, direct, 100)
+    total = solve_bounces(bounces, direct, 100)
     inside = gather.points.side == 0
     # b = albedo * emission: what the walls reflect; all reflections together: albedo / (1 - albedo).
     expected = albedo / (1 - albedo)
     assert np.average(total[0, inside, 0], weights=gather.area[inside]) == pytest.approx(expected, rel=0.02)
     assert transport.to_view(total[0]).mean() == pytest.approx(albedo * expected, rel=0.02)
-    two = solve_bounces(transport, direct, 2)
+    two = solve_bounces(bounces, direct, 2)
     mean = np.average(two[0, inside, 0], weights=gather.area[inside])
     assert mean == pytest.approx(albedo + albedo**2, rel=0.02)
-    assert np.array_equal(solve_bounces(transport, direct, 1), direct)
+    assert np.array_equal(solve_bounces(bounces, direct, 1), direct)
 
 
 def test_a_mirror_lets_rows_see_what_it_shows() -> None:
@@ -132,7 +130,7 @@ def test_a_mirror_lets_rows_see_what_it_shows() -> None:
     walls = box(2, inward=True)
     room = [Mesh(walls[:10], Material(0.5), path="/room"), Mesh(walls[10:], mirror, path="/mirror")]
     scene = make_snapshot(room, camera=look_at((0, 0, 0), (0, 0, -1), fov=90))
-    _, gather, transport = transport_of(scene, 300, 64)
+    _, gather, transport, bounces = transport_of(scene, 300, 64)
     rows = transport.lobes[0].rows
     on_mirror = (gather.points.instance == 1).astype(np.float32)[:, None]
     assert rows.matmul(on_mirror).max() == 0
@@ -149,7 +147,7 @@ def test_glossy_points_have_rows_that_multiply_their_specular_colours() -> None:
         [Mesh(quad(1), floor, path="/floor"), Mesh(box(20, inward=True), Material(1.0), path="/sky")],
         camera=look_at((0, 1.5, 0.5)),
     )
-    view, gather, transport = transport_of(scene, 400, 256)
+    view, gather, transport, bounces = transport_of(scene, 400, 256)
     assert [lobe.name for lobe in transport.lobes] == ["diffuse", "specular_base", "specular_edge"]
     on_floor = view.points.instance == 0
     base, edge = (lobe.rows.row_sums() for lobe in transport.lobes[1:])
@@ -166,13 +164,13 @@ def test_lamps_and_skies_send_nothing_through_the_transport() -> None:
     from icheat_usd.scene import LightKind
 
     scene = make_snapshot([Mesh(quad(1))], lights=[Light(LightKind.DOME)], camera=look_at((0, 1, 1)))
-    _, _, transport = transport_of(scene, 50, 32)
+    _, _, transport, bounces = transport_of(scene, 50, 32)
     assert transport.lobes[0].rows.n_entries == 0
 
 
 def test_rows_have_ascending_columns_without_repetition() -> None:
-    _, gather, transport = transport_of(cornell(8, 8), 200, 64)
-    for rows in (transport.lobes[0].rows, transport.bounce):
+    _, gather, transport, bounces = transport_of(cornell(8, 8), 200, 64)
+    for rows in (transport.lobes[0].rows, bounces.rows):
         assert rows.indptr[-1] == rows.n_entries
         for r in range(rows.n_rows):
             columns = rows.indices[rows.indptr[r] : rows.indptr[r + 1]]
@@ -184,22 +182,22 @@ def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads() -> None:
     results = []
     for threads in (1, 2):
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-        _, gather, transport = transport_of(cornell(12, 12), 200, 64)
+        _, gather, transport, bounces = transport_of(cornell(12, 12), 200, 64)
         light = np.random.default_rng(0).random((1, gather.n, 3)).astype(np.float32)
-        results.append((transport, transport.to_view(solve_bounces(transport, light, 4)[0])))
+        results.append((transport, bounces, transport.to_view(solve_bounces(bounces, light, 4)[0])))
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    (one, seen_one), (two, seen_two) = results
+    (one, bounces_one, seen_one), (two, bounces_two, seen_two) = results
     assert np.array_equal(one.lobes[0].rows.indices, two.lobes[0].rows.indices)
     assert np.array_equal(one.lobes[0].rows.weights, two.lobes[0].rows.weights)
-    assert np.array_equal(one.bounce.weights, two.bounce.weights)
+    assert np.array_equal(bounces_one.rows.weights, bounces_two.rows.weights)
     assert np.array_equal(seen_one, seen_two)
 
 
 def test_a_row_depends_on_its_view_sample_alone() -> None:
     scene = cornell(24, 24)
     tracer, view, gather = prepare(scene, 300)
-    whole = build_transport(scene, tracer, view, gather, rays_per_row=64, rays_per_bounce_row=4)
-    sparse = build_transport(scene, tracer, view, gather, rays_per_row=64, rays_per_bounce_row=4, row_spacing=4)
+    whole = build_transport(scene, tracer, view, gather, rays_per_row=64)
+    sparse = build_transport(scene, tracer, view, gather, rays_per_row=64, row_spacing=4)
     assert len(sparse.row_view) < view.n / 4
     for row, sample in enumerate(sparse.row_view.tolist()):
         a, b = sparse.lobes[0].rows.rows(row, row + 1), whole.lobes[0].rows.rows(sample, sample + 1)
@@ -209,8 +207,8 @@ def test_a_row_depends_on_its_view_sample_alone() -> None:
 def test_interpolated_rows_are_close_and_stay_on_their_surface() -> None:
     scene = cornell(48, 48)
     tracer, view, gather = prepare(scene, 400)
-    whole = build_transport(scene, tracer, view, gather, rays_per_row=256, rays_per_bounce_row=4)
-    sparse = build_transport(scene, tracer, view, gather, rays_per_row=256, rays_per_bounce_row=4, row_spacing=3)
+    whole = build_transport(scene, tracer, view, gather, rays_per_row=256)
+    sparse = build_transport(scene, tracer, view, gather, rays_per_row=256, row_spacing=3)
     weights = sparse.interpolation
     assert weights is not None
     np.testing.assert_allclose(weights.row_sums(), 1, rtol=1e-5)
@@ -228,11 +226,11 @@ def test_interpolated_rows_are_close_and_stay_on_their_surface() -> None:
 
 
 def test_bounces_refuse_light_of_another_gather_set() -> None:
-    _, gather, transport = transport_of(closed_box(), 60, 8)
+    _, gather, transport, bounces = transport_of(closed_box(), 60, 8)
     with pytest.raises(ValueError, match="gather cells"):
-        solve_bounces(transport, np.zeros((1, gather.n + 1, 3), np.float32), 2)
+        solve_bounces(bounces, np.zeros((1, gather.n + 1, 3), np.float32), 2)
     with pytest.raises(ValueError, match="at least one"):
-        solve_bounces(transport, np.zeros((1, gather.n, 3), np.float32), 0)
+        solve_bounces(bounces, np.zeros((1, gather.n, 3), np.float32), 0)
 
 
 def test_progress_runs_from_nothing_to_all_of_each_step() -> None:
@@ -245,9 +243,9 @@ def test_progress_runs_from_nothing_to_all_of_each_step() -> None:
         view,
         gather,
         rays_per_row=8,
-        rays_per_bounce_row=8,
         progress=lambda s, f: seen.setdefault(s, []).append(f),
     )
+    build_bounces(scene, tracer, gather, rays_per_row=8, progress=lambda s, f: seen.setdefault(s, []).append(f))
     assert len(seen) == 2
     for fractions in seen.values():
         assert fractions[0] == 0 and fractions[-1] == 1 and fractions == sorted(fractions)

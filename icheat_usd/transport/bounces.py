@@ -1,0 +1,138 @@
+"""Light between gather cells: every bounce but the last."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icheat_usd.kernels import rows as row_kernels
+from icheat_usd.lighting import build_light_sampler
+from icheat_usd.materials import effective_albedo
+from icheat_usd.progress import Progress, silent
+from icheat_usd.samples import GatherSamples, cell_direct
+from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.tracing import Tracer
+from icheat_usd.transport.rays import RowBuilder
+from icheat_usd.transport.sparse import SparseRows
+
+_CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
+
+
+@dataclass(frozen=True)
+class Bounces:
+    """Light from gather cells to gather cells; no view in it, so cameras share it."""
+
+    rows: SparseRows  #: (n_gather x n_gather) form factors without albedo; row sums at most 1
+    albedo: F32  #: (n_gather, 3) mean reflectance of the cells
+
+
+@dataclass(frozen=True, eq=False)
+class CellLight:
+    """Radiance that leaves the gather cells diffusely, per light; emission is not in it."""
+
+    direct: F32  #: (n_lights, n_gather, 3) after one reflection
+    radiance: F32  #: (n_lights, n_gather, 3) after all reflections but the last
+
+    def total(self) -> F32:
+        """All lights together, the `b` of the transport: (n_gather, 3)."""
+        return sum_lights(self.radiance)
+
+
+def sum_lights(per_light: F32) -> F32:
+    """Sum (n_lights, n, 3) over the lights, in their order."""
+    total = np.zeros(per_light.shape[1:], np.float32)
+    for values in per_light:
+        total += values
+    return total
+
+
+def build_bounces(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    gather: GatherSamples,
+    *,
+    rays_per_row: int = 256,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Bounces:
+    """Measure with gather rays what the cells receive from each other.
+
+    Rays start from the patch points, so that a row is the mean over its cell.
+    """
+    builder = RowBuilder(snapshot, tracer, gather, seed)
+    rows = builder.diffuse_rows(
+        gather.patch_points,
+        gather.cell_begin,
+        np.arange(gather.n, dtype=np.int64),
+        rays_per_row,
+        1,
+        progress,
+        "bounce rays",
+    )
+    albedo = np.empty((gather.n, 3), np.float32)
+    row_kernels.mean_over_segments(gather.cell_begin, effective_albedo(gather.patch_points), albedo)
+    return Bounces(rows, albedo)
+
+
+def solve_bounces(bounces: Bounces, direct: F32, n_bounces: int) -> F32:
+    """Radiance that leaves the cells after one to `n_bounces` diffuse reflections.
+
+    Jacobi steps of ``g = b + albedo * (R g)``, stopped when a step changes less
+    than 1e-4 of the total.
+
+    Parameters
+    ----------
+    direct : (n_lights, n_gather, 3) float32
+        Reflected direct radiance b, per light.
+    n_bounces
+        1 returns `direct` as it is.
+
+    Returns
+    -------
+    (n_lights, n_gather, 3) float32
+
+    Raises
+    ------
+    ValueError
+        `n_bounces` is less than 1, or `direct` belongs to another gather set.
+    """
+    if n_bounces < 1:
+        raise ValueError(f"light needs at least one reflection on the way to a gather cell, not {n_bounces}")
+    if direct.ndim != 3 or direct.shape[1:] != (bounces.rows.n_rows, 3):
+        raise ValueError(f"direct light of shape {direct.shape} for {bounces.rows.n_rows} gather cells")
+    out = direct.astype(np.float32, copy=True)
+    for light in range(len(direct)):
+        last = direct[light]
+        for _ in range(n_bounces - 1):
+            last = bounces.albedo * bounces.rows.matmul(last)
+            out[light] += last
+            if np.abs(last).sum(dtype=np.float64) <= _CONVERGED * np.abs(out[light]).sum(dtype=np.float64):
+                break
+    return out
+
+
+def light_cells(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    gather: GatherSamples,
+    bounces: Bounces,
+    *,
+    n_bounces: int = 16,
+    light_samples: int = 16,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> CellLight:
+    """Light the gather cells and solve the bounces between them.
+
+    Parameters
+    ----------
+    n_bounces : int
+        Diffuse reflections before the last one; 1 is direct light once reflected.
+    light_samples : int
+        Shadow rays per light and patch point.
+    """
+    progress("light the gather samples", 0.0)
+    direct = cell_direct(snapshot, tracer, build_light_sampler(snapshot), gather, light_samples, seed)
+    progress("solve the bounces", 0.0)
+    return CellLight(direct, solve_bounces(bounces, direct, n_bounces))
