@@ -75,6 +75,8 @@ def divide(incident: F32, wanted: F32) -> PairCoefficients:
     """
     floor = RELATIVE_EPSILON * incident.max(axis=1, keepdims=True)
     divisible = incident > np.maximum(floor, np.float32(0))
-    ratio = np.where(divisible, wanted / np.where(divisible, incident, np.float32(1)), np.float32(1))
-    ratio = np.minimum(ratio, MAX_RATIO).astype(np.float32)
+    # Clipped before the division, which so cannot overflow however faint the light.
+    reached = np.minimum(wanted, MAX_RATIO * incident)
+    one = np.float32(1)
+    ratio = np.where(divisible, reached / np.where(divisible, incident, one), one).astype(np.float32)
     return PairCoefficients(scale=ratio, emission=(wanted - ratio * incident).astype(np.float32))
