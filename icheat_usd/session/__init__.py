@@ -1,24 +1,25 @@
 """An open document without a window: what scripts, the shell and user interfaces talk to.
 
-session = Session.open("shot.usda", camera="/World/Camera", frame=12)
-session.add_edit("warm", layer="shot.usda", operation="scale", parameters={"color": (1.4, 1.1, 0.8)},
-                 receivers=["/World/Figure"], casters=["/World/Room/Wall"])
-write_exr(session.relight(), "preview.exr")
-write_exr(session.render(), "final.exr")
+    session = Session.open("shot.usda", camera="/World/Camera", frame=12)
+    session.add_edit("warm", layer="shot.usda", operation="scale", parameters={"color": (1.4, 1.1, 0.8)},
+                     receivers=["/World/Figure"], casters=["/World/Room/Wall"])
+    write_exr(session.relight(), "preview.exr")
+    write_exr(session.render(), "final.exr")
+
+Names are loaded when first used: authoring needs no kernels, and should not wait for them.
 """
 
-from icheat_usd.edits.painting import soft_sphere
-from icheat_usd.final_gather import GatherSettings
-from icheat_usd.session.authoring import (
-    add_edit,
-    create_stack,
-    move_edit,
-    mute_edit,
-    remove_edit,
-    set_edit,
-)
-from icheat_usd.session.document import Session
-from icheat_usd.session.quality import DRAFT, Quality
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from icheat_usd.edits.painting import soft_sphere
+    from icheat_usd.final_gather import GatherSettings
+    from icheat_usd.session.authoring import add_edit, create_stack, move_edit, mute_edit, remove_edit, set_edit
+    from icheat_usd.session.document import Session
+    from icheat_usd.session.quality import DRAFT, Quality
 
 __all__ = [
     "DRAFT",
@@ -33,3 +34,17 @@ __all__ = [
     "set_edit",
     "soft_sphere",
 ]
+
+_HOMES = {
+    "soft_sphere": "icheat_usd.edits.painting",
+    "GatherSettings": "icheat_usd.final_gather",
+    "Session": "icheat_usd.session.document",
+    "DRAFT": "icheat_usd.session.quality",
+    "Quality": "icheat_usd.session.quality",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES.get(name, "icheat_usd.session.authoring")), name)
