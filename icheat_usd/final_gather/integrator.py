@@ -21,8 +21,8 @@ from icheat_usd.errors import EditError
 from icheat_usd.final_gather.hits import reflected_radiance, trace_hemisphere
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.transport import point_sets
-from icheat_usd.lighting import LightSampler, build_light_sampler, reflected_direct
-from icheat_usd.materials import is_glossy, sample_specular, take_points
+from icheat_usd.lighting import LightSampler, build_light_sampler, reflected_direct, samples_per_light
+from icheat_usd.materials import concatenate_points, is_glossy, sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
 from icheat_usd.samples.develop import average, develop
@@ -31,6 +31,9 @@ from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
 #: Gather rays in flight; bounds memory and keeps a chunk's arrays near the caches.
 RAYS_AT_ONCE = 1 << 19
+
+#: Where pilot points are taken from in the picture, at most.
+PILOT_ROWS, PILOT_COLUMNS = 24, 128
 
 #: Light that leaves points on casters as the edits should see its colour, free of noise: (n,) points -> (n, 3).
 IncidentColor = Callable[[SurfacePoints], F32]
@@ -45,6 +48,7 @@ class GatherSettings:
     light_samples: int = 4  #: shadow rays per light and camera sample, for direct light
     n_bounces: int = 16  #: diffuse reflections before the last one
     seed: int = 0
+    dome_samples: int | None = None  #: `light_samples` of domes; 4 times those of other lights by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +119,9 @@ def final_gather(
     incident = None
     if gather is not None and gather_radiance is not None:
         incident = _incident_from(gather, gather_radiance)
-    gatherer = _Gatherer(
-        snapshot, tracer, build_light_sampler(snapshot), field, incident, gather, gather_radiance, settings
-    )
+    progress("gather", 0.0)
+    sampler = build_light_sampler(snapshot, tracer, _pilot_points(snapshot, tracer, settings.seed), settings.seed)
+    gatherer = _Gatherer(snapshot, tracer, sampler, field, incident, gather, gather_radiance, settings)
     n_pixels = snapshot.camera.width * snapshot.camera.height
     band = max(RAYS_AT_ONCE // (settings.samples_per_pixel * max(settings.gather_rays, 1)), 1)
     bands: list[dict[str, F64]] = []
@@ -139,6 +143,27 @@ def final_gather(
     return FinalGather(**layers)
 
 
+def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> SurfacePoints:
+    """Some of the points that light will be asked for: seen in a few rows of the picture, or hit from there."""
+    width, height = snapshot.camera.width, snapshot.camera.height
+    rows = np.unique(np.linspace(0, height - 1, PILOT_ROWS + 2)[1:-1].round().astype(np.int64))
+    found = []
+    for row in rows.tolist():
+        pixels = (row * width, (row + 1) * width)
+        points = view_samples(snapshot, tracer, samples_per_pixel=1, seed=seed, max_splits=0, pixels=pixels).points
+        found.append(take_points(points, np.arange(0, len(points.instance), max(1, width // PILOT_COLUMNS))))
+    points = concatenate_points(*found)
+    found = [points]
+    for bounce, n_rays in enumerate((4, 1)):
+        stream = np.arange(len(points.instance), dtype=np.int64)
+        points, through = trace_hemisphere(
+            snapshot, tracer, points, stream, n_rays, int(hash_combine(seed, 20 + bounce))
+        )
+        points = take_points(points, np.flatnonzero(through.any(axis=1)))
+        found.append(points)
+    return concatenate_points(*found)
+
+
 def _incident_from(gather: GatherSamples, radiance: F32) -> IncidentColor:
     def color(points: SurfacePoints) -> F32:
         return radiance[gather.locate(points)]
@@ -155,7 +180,7 @@ def _band(gatherer: _Gatherer, view: ViewSamples, pixels: tuple[int, int], seed:
         view.points,
         view.to_eye,
         seed,
-        gatherer.settings.light_samples,
+        samples_per_light(gatherer.snapshot, gatherer.settings.light_samples, gatherer.settings.dome_samples),
     ).sum(axis=0)
     light = _indirect(gatherer, view.points, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
     return {

@@ -10,8 +10,18 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import parallel_kernel
 from icheat_usd.kernels.environment import F32, F64, Table
+from icheat_usd.kernels.guide import (
+    COSINE_SHARE,
+    find_row,
+    image_density,
+    plain_dome_pdf,
+    sphere_direction,
+    warp,
+)
 from icheat_usd.kernels.lights import hit_shape, light_shape, mesh_pdf, sample_mesh, sample_shape
 from icheat_usd.kernels.random import hash_combine, sobol_pair
+
+_DOME = 5
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
@@ -22,6 +32,7 @@ def fill_analytic(
     lights: Table,
     textures: Table,
     tables: Table,
+    guide: Table,
     light: int,
     position: F32,
     normal: F32,
@@ -43,6 +54,7 @@ def fill_analytic(
     """
     kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
     texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
+    axis, split, child, rows, bands, columns = guide
     red, green, blue = lights.radiance[light, 0], lights.radiance[light, 1], lights.radiance[light, 2]
     for i in prange(position.shape[0]):
         if instance[i] < 0:
@@ -51,8 +63,17 @@ def fill_analytic(
         px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
         gx, gy, gz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
         nx, ny, nz = float(shading_normal[i, 0]), float(shading_normal[i, 1]), float(shading_normal[i, 2])
+        guided = -1
+        if kind == _DOME:
+            guided = find_row(axis, split, child, rows, light, px, py, pz, nx, ny, nz)
         for k in range(n_samples):
             u1, u2 = sobol_pair(k, sequence)
+            v1, v2 = float(u1), float(u2)
+            factor = 1.0
+            if guided >= 0 and image[0] >= 0:
+                v1, v2, factor = warp(bands, columns, guided, v1, v2)
+            elif guided >= 0:
+                v1 /= COSINE_SHARE
             wx, wy, wz, t, p, r, g, b = sample_shape(
                 kind,
                 m,
@@ -68,9 +89,15 @@ def fill_analytic(
                 nx,
                 ny,
                 nz,
-                float(u1),
-                float(u2),
+                min(v1, 1.0),
+                v2,
             )
+            p *= factor
+            if guided >= 0 and image[0] < 0:
+                if v1 >= 1.0:
+                    v1, v2, factor = warp(bands, columns, guided, (u1 - COSINE_SHARE) / (1.0 - COSINE_SHARE), float(u2))
+                    wx, wy, wz = sphere_direction(v1, v2)
+                p = plain_dome_pdf(bands, columns, guided, nx, ny, nz, wx, wy, wz)
             if p <= 0.0:
                 continue
             shading_cosine = wx * nx + wy * ny + wz * nz
@@ -181,6 +208,7 @@ def meet_analytic(
     lights: Table,
     textures: Table,
     tables: Table,
+    guide: Table,
     light: int,
     position: F32,
     shading_normal: F32,
@@ -192,6 +220,7 @@ def meet_analytic(
     """Where rays from surface points meet a light that is no mesh; rows of those that miss stay zero."""
     kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
     texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
+    axis, split, child, rows, bands, columns = guide
     for i in prange(position.shape[0]):
         t, p, r, g, b = hit_shape(
             kind,
@@ -214,6 +243,15 @@ def meet_analytic(
         )
         if t <= 0.0:
             continue
+        if kind == _DOME:
+            px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
+            nx, ny, nz = float(shading_normal[i, 0]), float(shading_normal[i, 1]), float(shading_normal[i, 2])
+            wx, wy, wz = float(direction[i, 0]), float(direction[i, 1]), float(direction[i, 2])
+            guided = find_row(axis, split, child, rows, light, px, py, pz, nx, ny, nz)
+            if guided >= 0 and image[0] >= 0:
+                p *= image_density(bands, columns, guided, rows_cdf, columns_cdf, image, inverse, wx, wy, wz)
+            elif guided >= 0:
+                p = plain_dome_pdf(bands, columns, guided, nx, ny, nz, wx, wy, wz)
         distance[i] = t
         pdf[i] = p
         radiance[i, 0] = r * lights.radiance[light, 0]

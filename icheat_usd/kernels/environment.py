@@ -54,11 +54,21 @@ def image_bilinear(
     w10 = fx * (1.0 - fy)
     w01 = (1.0 - fx) * fy
     w11 = fx * fy
-    return (
-        w00 * texels[i00, 0] + w10 * texels[i10, 0] + w01 * texels[i01, 0] + w11 * texels[i11, 0],
-        w00 * texels[i00, 1] + w10 * texels[i10, 1] + w01 * texels[i01, 1] + w11 * texels[i11, 1],
-        w00 * texels[i00, 2] + w10 * texels[i10, 2] + w01 * texels[i01, 2] + w11 * texels[i11, 2],
-    )
+    red = w00 * texels[i00, 0] + w10 * texels[i10, 0] + w01 * texels[i01, 0] + w11 * texels[i11, 0]
+    green = w00 * texels[i00, 1] + w10 * texels[i10, 1] + w01 * texels[i01, 1] + w11 * texels[i11, 1]
+    blue = w00 * texels[i00, 2] + w10 * texels[i10, 2] + w01 * texels[i01, 2] + w11 * texels[i11, 2]
+    if math.isfinite(red + green + blue):
+        return red, green, blue
+    # texels that are no number count as black: one of them must not spoil a whole picture
+    red = 0.0
+    green = 0.0
+    blue = 0.0
+    for weight, k in ((w00, i00), (w10, i10), (w01, i01), (w11, i11)):
+        if math.isfinite(texels[k, 0] + texels[k, 1] + texels[k, 2]):
+            red += weight * texels[k, 0]
+            green += weight * texels[k, 1]
+            blue += weight * texels[k, 2]
+    return red, green, blue
 
 
 @kernel
@@ -89,7 +99,8 @@ def _mean_over_texel(texels: F32, begin: int, width: int, height: int, column: i
             x = (column + i) % width
             k = begin + y * width + x
             luminance = 0.2126 * texels[k, 0] + 0.7152 * texels[k, 1] + 0.0722 * texels[k, 2]
-            total += wy * (0.75 if i == 0 else 0.125) * max(luminance, 0.0)
+            if math.isfinite(luminance):
+                total += wy * (0.75 if i == 0 else 0.125) * max(luminance, 0.0)
     return total
 
 
@@ -175,6 +186,25 @@ def dome_image_pdf(
     p_column = columns_cdf[k] - (columns_cdf[k - 1] if column > 0 else 0.0)
     band = math.cos(math.pi * row / height) - math.cos(math.pi * (row + 1) / height)
     return p_row * p_column * width / (2.0 * math.pi * band)
+
+
+@kernel
+def dome_image_numbers(
+    rows_cdf: F64, rows_begin: int, columns_cdf: F32, columns_begin: int, width: int, height: int,
+    x: float, y: float, z: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Random numbers (u1, u2) for which `sample_dome_image` returns a unit direction."""
+    s, t = latlong_coordinates(x, y, z)
+    row = min(max(int(t * height), 0), height - 1)
+    column = min(max(int(s * width), 0), width - 1)
+    below = rows_cdf[rows_begin + row - 1] if row > 0 else 0.0
+    k = columns_begin + row * width + column
+    left = columns_cdf[k - 1] if column > 0 else 0.0
+    top = math.cos(math.pi * row / height)
+    bottom = math.cos(math.pi * (row + 1) / height)
+    fraction_y = min(max((top - y) / (top - bottom), 0.0), 1.0)
+    fraction_x = min(max(s * width - column, 0.0), 1.0)
+    return left + fraction_x * (columns_cdf[k] - left), below + fraction_y * (rows_cdf[rows_begin + row] - below)
 
 
 @parallel_kernel

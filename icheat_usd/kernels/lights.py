@@ -57,7 +57,7 @@ def _cross(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> 
 
 
 @kernel
-def _normalized(x: float, y: float, z: float) -> Floats:
+def normalized(x: float, y: float, z: float) -> Floats:
     length = math.sqrt(x * x + y * y + z * z)
     if length == 0.0:
         return 0.0, 0.0, 0.0
@@ -87,7 +87,7 @@ def local_frame(tables: Table, light: int) -> Floats:
 
 
 @kernel
-def _linear(m: Floats, x: float, y: float, z: float) -> Floats:
+def linear_map(m: Floats, x: float, y: float, z: float) -> Floats:
     """M (x, y, z) for the 3 x 3 part of a frame."""
     return (
         m[0] * x + m[1] * y + m[2] * z,
@@ -265,7 +265,7 @@ def _sample_disk(m: Floats, radius: float, px: float, py: float, pz: float, u1: 
 @kernel
 def _direction_scale(m: Floats, determinant: float, x: float, y: float, z: float) -> float:
     """World solid angle pdf over local one, for the unit local direction (x, y, z)."""
-    wx, wy, wz = _linear(m, x, y, z)
+    wx, wy, wz = linear_map(m, x, y, z)
     length = math.sqrt(_dot(wx, wy, wz, wx, wy, wz))
     return length * length * length / determinant
 
@@ -277,7 +277,7 @@ def _sample_sphere(
     """Cone that the sphere fills, in the space where it is the unit sphere; emits outwards only."""
     if radius <= 0.0 or determinant == 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    qx, qy, qz = _linear(inverse, m[3] - px, m[7] - py, m[11] - pz)
+    qx, qy, qz = linear_map(inverse, m[3] - px, m[7] - py, m[11] - pz)
     qx, qy, qz = qx / radius, qy / radius, qz / radius
     d2 = _dot(qx, qy, qz, qx, qy, qz)
     if d2 <= 1.0:
@@ -298,7 +298,7 @@ def _sample_sphere(
     dz = a * sz + b * tz + cos_theta * zz
     t = d * cos_theta - math.sqrt(max(0.0, 1.0 - d2 * sin2))
     pdf = _direction_scale(m, determinant, dx, dy, dz) / (2.0 * math.pi * one_minus_cos)
-    wx, wy, wz = _linear(m, dx * radius * t, dy * radius * t, dz * radius * t)
+    wx, wy, wz = linear_map(m, dx * radius * t, dy * radius * t, dz * radius * t)
     distance = math.sqrt(_dot(wx, wy, wz, wx, wy, wz))
     if distance == 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -322,7 +322,7 @@ def _sample_cylinder(
     if radius <= 0.0 or length <= 0.0 or determinant == 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     ox, oy, oz = px - m[3], py - m[7], pz - m[11]
-    lx, ly, lz = _linear(inverse, ox, oy, oz)
+    lx, ly, lz = linear_map(inverse, ox, oy, oz)
     rho = math.sqrt(ly * ly + lz * lz)
     if rho <= radius:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -330,9 +330,9 @@ def _sample_cylinder(
     phi = math.atan2(lz, ly) + half * (2.0 * u2 - 1.0)
     c = math.cos(phi)
     s = math.sin(phi)
-    wx, wy, wz = _linear(m, (u1 - 0.5) * length, radius * c, radius * s)
+    wx, wy, wz = linear_map(m, (u1 - 0.5) * length, radius * c, radius * s)
     ax, ay, az = m[0], m[4], m[8]
-    bx, by, bz = _linear(m, 0.0, -radius * s, radius * c)
+    bx, by, bz = linear_map(m, 0.0, -radius * s, radius * c)
     nx, ny, nz = _cross(ax, ay, az, bx, by, bz)
     jacobian = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
     dx, dy, dz = wx - ox, wy - oy, wz - oz
@@ -349,7 +349,7 @@ def _sample_cylinder(
 @kernel
 def _sample_distant(m: Floats, angle: float, u1: float, u2: float) -> Floats:
     """Cone about local +Z; a half-angle of zero is one direction whose `radiance` is an irradiance (pdf 1)."""
-    zx, zy, zz = _normalized(m[2], m[6], m[10])
+    zx, zy, zz = normalized(m[2], m[6], m[10])
     if angle <= 0.0:
         return zx, zy, zz, _FAR, 1.0, 0.0, 0.0
     half_sine = math.sin(0.5 * angle)
@@ -427,8 +427,8 @@ def sample_shape(
         s, t = latlong_coordinates(x, y, z)
         red, green, blue = image_bilinear(texels, begin, width, height, s, t, True)
         pdf *= _direction_scale(m, determinant, x, y, z)
-        wx, wy, wz = _linear(m, x, y, z)
-        wx, wy, wz = _normalized(wx, wy, wz)
+        wx, wy, wz = linear_map(m, x, y, z)
+        wx, wy, wz = normalized(wx, wy, wz)
         return wx, wy, wz, _FAR, pdf, red, green, blue
     if kind == _SPHERE:
         wx, wy, wz, distance, pdf, x, y = _sample_sphere(m, inverse, determinant, a, px, py, pz, u1, u2)
@@ -468,9 +468,9 @@ def _angle(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> 
 
 @kernel
 def _corner_directions(p: F64, px: float, py: float, pz: float) -> Floats:
-    ax, ay, az = _normalized(p[0, 0] - px, p[0, 1] - py, p[0, 2] - pz)
-    bx, by, bz = _normalized(p[1, 0] - px, p[1, 1] - py, p[1, 2] - pz)
-    cx, cy, cz = _normalized(p[2, 0] - px, p[2, 1] - py, p[2, 2] - pz)
+    ax, ay, az = normalized(p[0, 0] - px, p[0, 1] - py, p[0, 2] - pz)
+    bx, by, bz = normalized(p[1, 0] - px, p[1, 1] - py, p[1, 2] - pz)
+    cx, cy, cz = normalized(p[2, 0] - px, p[2, 1] - py, p[2, 2] - pz)
     return ax, ay, az, bx, by, bz, cx, cy, cz
 
 
@@ -488,7 +488,7 @@ def _solid_angle(p: F64, px: float, py: float, pz: float) -> float:
 def _towards(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> Floats:
     """Unit part of a that is perpendicular to the unit vector b."""
     along = _dot(ax, ay, az, bx, by, bz)
-    return _normalized(ax - along * bx, ay - along * by, az - along * bz)
+    return normalized(ax - along * bx, ay - along * by, az - along * bz)
 
 
 @kernel
@@ -503,9 +503,9 @@ def _sample_spherical_triangle(p: F64, px: float, py: float, pz: float, u1: floa
     )
     if shortest < 1e-24:
         return -1.0, -1.0
-    abx, aby, abz = _normalized(abx, aby, abz)
-    bcx, bcy, bcz = _normalized(bcx, bcy, bcz)
-    cax, cay, caz = _normalized(cax, cay, caz)
+    abx, aby, abz = normalized(abx, aby, abz)
+    bcx, bcy, bcz = normalized(bcx, bcy, bcz)
+    cax, cay, caz = normalized(cax, cay, caz)
     alpha = _angle(abx, aby, abz, -cax, -cay, -caz)
     beta = _angle(bcx, bcy, bcz, -abx, -aby, -abz)
     gamma = _angle(cax, cay, caz, -bcx, -bcy, -bcz)
@@ -642,9 +642,9 @@ def _hit_sphere(
 ) -> Floats:
     if radius <= 0.0 or determinant == 0.0:
         return 0.0, 0.0, 0.0, 0.0
-    qx, qy, qz = _linear(inverse, m[3] - px, m[7] - py, m[11] - pz)
+    qx, qy, qz = linear_map(inverse, m[3] - px, m[7] - py, m[11] - pz)
     qx, qy, qz = qx / radius, qy / radius, qz / radius
-    dx, dy, dz = _linear(inverse, wx, wy, wz)
+    dx, dy, dz = linear_map(inverse, wx, wy, wz)
     length = math.sqrt(_dot(dx, dy, dz, dx, dy, dz))
     dx, dy, dz = dx / length, dy / length, dz / length
     d2 = _dot(qx, qy, qz, qx, qy, qz)
@@ -678,8 +678,8 @@ def _hit_cylinder(
 ) -> Floats:
     if radius <= 0.0 or length <= 0.0 or determinant == 0.0:
         return 0.0, 0.0, 0.0, 0.0
-    lx, ly, lz = _linear(inverse, px - m[3], py - m[7], pz - m[11])
-    dx, dy, dz = _linear(inverse, wx, wy, wz)
+    lx, ly, lz = linear_map(inverse, px - m[3], py - m[7], pz - m[11])
+    dx, dy, dz = linear_map(inverse, wx, wy, wz)
     rho = math.sqrt(ly * ly + lz * lz)
     a = dy * dy + dz * dz
     b = -(ly * dy + lz * dz)
@@ -695,7 +695,7 @@ def _hit_cylinder(
     y = ly + t * dy
     z = lz + t * dz
     # tangents along the axis and around it (per radian)
-    bx, by, bz = _linear(m, 0.0, -z, y)
+    bx, by, bz = linear_map(m, 0.0, -z, y)
     nx, ny, nz = _cross(m[0], m[4], m[8], bx, by, bz)
     jacobian = math.sqrt(_dot(nx, ny, nz, nx, ny, nz))
     cosine = abs(_dot(nx, ny, nz, wx, wy, wz)) / jacobian
@@ -707,7 +707,7 @@ def _hit_cylinder(
 
 @kernel
 def _hit_distant(m: Floats, angle: float, wx: float, wy: float, wz: float) -> Floats:
-    zx, zy, zz = _normalized(m[2], m[6], m[10])
+    zx, zy, zz = normalized(m[2], m[6], m[10])
     half_sine = math.sin(0.5 * angle)
     chord2 = (wx - zx) * (wx - zx) + (wy - zy) * (wy - zy) + (wz - zz) * (wz - zz)
     if half_sine <= 0.0 or chord2 > 4.0 * half_sine * half_sine:
@@ -728,8 +728,8 @@ def hit_shape(
         if determinant == 0.0:
             return 0.0, 0.0, 0.0, 0.0, 0.0
         begin, width, height, rows_begin, columns_begin = image
-        x, y, z = _linear(inverse, wx, wy, wz)
-        x, y, z = _normalized(x, y, z)
+        x, y, z = linear_map(inverse, wx, wy, wz)
+        x, y, z = normalized(x, y, z)
         pdf = dome_image_pdf(rows_cdf, rows_begin, columns_cdf, columns_begin, width, height, x, y, z)
         s, t = latlong_coordinates(x, y, z)
         red, green, blue = image_bilinear(texels, begin, width, height, s, t, True)

@@ -1,6 +1,6 @@
 """Light sources: sampling, environment maps, direct light at surface points."""
 
-from icheat_usd.lighting.direct import irradiance, reflected_direct
+from icheat_usd.lighting.direct import irradiance, reflected_direct, samples_per_light
 from icheat_usd.lighting.environment import environment_radiance, environment_radiance_per_light
 from icheat_usd.lighting.sampler import LightSampler, build_light_sampler, total_power
 
@@ -11,5 +11,6 @@ __all__ = [
     "environment_radiance_per_light",
     "irradiance",
     "reflected_direct",
+    "samples_per_light",
     "total_power",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -47,7 +48,7 @@ def irradiance(
     sampler: LightSampler,
     points: SurfacePoints,
     seed: int,
-    n_samples: int,
+    n_samples: int | Sequence[int],
 ) -> F32:
     """Irradiance of every light at surface points, shadowed by the scene.
 
@@ -55,7 +56,7 @@ def irradiance(
     ----------
     points : SurfacePoints of n points
         Those with ``instance == -1`` get zero.
-    n_samples : int
+    n_samples : int or one int per light
         Shadow rays per point and light; powers of two are stratified best. A distant light without
         an angle takes one.
 
@@ -68,7 +69,8 @@ def irradiance(
     -----
     Rectangles are sampled uniformly in solid angle [1]_, spheres in the cone they fill, cylinders over
     the side that is in sight, disks and mesh triangles by area, domes by their image or, without one,
-    by the cosine. Random numbers depend on (seed, point, light, sample) alone.
+    by the cosine, and by what the sampler's guide has learnt of their visibility. Random numbers depend
+    on (seed, point, light, sample) alone.
 
     References
     ----------
@@ -84,7 +86,7 @@ def reflected_direct(
     points: SurfacePoints,
     to_eye: F32,
     seed: int,
-    n_samples: int,
+    n_samples: int | Sequence[int],
 ) -> F32:
     """Radiance that surface points reflect towards the eye, straight from each light.
 
@@ -100,8 +102,8 @@ def reflected_direct(
     Notes
     -----
     The diffuse lobe is sampled by `n_samples` shadow rays per light. The specular lobe shares those with
-    ``n_samples // 2`` (at least one) rays of its own per point, which look for every light, analytic ones
-    included; the two are joined by the power heuristic [1]_. A distant light without an angle is found by
+    half the largest `n_samples` (at least one) rays of its own per point, which look for every light,
+    analytic ones included; the two are joined by the power heuristic [1]_. A distant light without an angle is found by
     its shadow ray alone. Glass dims light without bending it, as for all shadow rays.
 
     References
@@ -110,8 +112,32 @@ def reflected_direct(
     """
     eye = np.require(to_eye, np.float32, ("C", "W"))
     out = _direct(snapshot, tracer, sampler, points, seed, n_samples, eye)
-    _add_specular_rays(snapshot, tracer, sampler, points, eye, seed, max(int(n_samples), 1), out)
+    counts = _counts(n_samples, len(snapshot.lights.kind))
+    _add_specular_rays(snapshot, tracer, sampler, points, eye, seed, counts, out)
     return out
+
+
+def samples_per_light(snapshot: SceneSnapshot, light_samples: int, dome_samples: int | None) -> list[int]:
+    """Shadow rays for each light: domes get `dome_samples`, or four times `light_samples` where that is None.
+
+    A dome is the light with most to miss: all of the sky, behind anything.
+    """
+    of_dome = 4 * light_samples if dome_samples is None else dome_samples
+    return [of_dome if kind == LightKind.DOME else light_samples for kind in snapshot.lights.kind.tolist()]
+
+
+def _counts(n_samples: int | Sequence[int], n_lights: int) -> list[int]:
+    """Shadow rays of each light, at least one.
+
+    Raises
+    ------
+    ValueError
+        A sequence has not one entry per light.
+    """
+    counts = list(n_samples) if isinstance(n_samples, Sequence) else [int(n_samples)] * n_lights
+    if len(counts) != n_lights:
+        raise ValueError(f"{len(counts)} sample counts for {n_lights} lights; give one for each, or a single number")
+    return [max(int(count), 1) for count in counts]
 
 
 def _direct(
@@ -120,16 +146,17 @@ def _direct(
     sampler: LightSampler,
     points: SurfacePoints,
     seed: int,
-    n_samples: int,
+    n_samples: int | Sequence[int],
     to_eye: F32 | None,
 ) -> F32:
     lights = snapshot.lights
     n = len(points.position)
-    n_samples = max(int(n_samples), 1)
+    counts = _counts(n_samples, len(lights.kind))
+    n_specular = _n_specular(counts)
     out = np.zeros((len(lights.kind), n, 3), np.float32)
     for light in np.flatnonzero(lights.radiance.any(axis=1)).tolist():
         delta = _is_delta(snapshot, light)
-        count = 1 if delta else n_samples
+        count = 1 if delta else counts[light]
         step = max(1, _RAYS // count)
         for first in range(0, n, step):
             part = slice(first, min(first + step, n))
@@ -139,7 +166,7 @@ def _direct(
                 continue
             value = rays.radiance
             if to_eye is not None:
-                value = value * _response(chunk, to_eye[part], rays, None if delta else n_samples)
+                value = value * _response(chunk, to_eye[part], rays, None if delta else (count, n_specular))
                 lit = np.flatnonzero(value.any(axis=1))
                 rays, value = rays.take(lit), value[lit]
             value = value * _visibility(snapshot, tracer, chunk, rays)
@@ -152,9 +179,9 @@ def _is_delta(snapshot: SceneSnapshot, light: int) -> bool:
     return bool(snapshot.lights.kind[light] == LightKind.DISTANT and snapshot.lights.size[light, 0] <= 0.0)
 
 
-def _n_specular(n_samples: int) -> int:
-    """Rays of the specular lobe per point, beside `n_samples` shadow rays per light; they serve all lights."""
-    return max(1, n_samples // 2)
+def _n_specular(counts: list[int]) -> int:
+    """Rays of the specular lobe per point, beside the shadow rays of each light; they serve all lights."""
+    return max(1, max(counts, default=1) // 2)
 
 
 def _power_heuristic(this: F64, other: F64) -> F32:
@@ -168,20 +195,18 @@ def _add(values: F32, point: NDArray[np.int64], out: F32) -> None:
     sum_rays(np.ascontiguousarray(values, np.float32), begin, out)
 
 
-def _response(chunk: SurfacePoints, to_eye: F32, rays: _ShadowRays, n_samples: int | None) -> F32:
-    """BRDF times cosine; the specular part weighted against specular rays if `n_samples` is given."""
+def _response(chunk: SurfacePoints, to_eye: F32, rays: _ShadowRays, shares: tuple[int, int] | None) -> F32:
+    """BRDF times cosine; the specular part weighted by the numbers of shadow and specular rays if there are both."""
     points, eye = take_points(chunk, rays.point), to_eye[rays.point]
     glossy = np.flatnonzero(is_glossy(points))
-    if n_samples is None or not len(glossy):
+    if shares is None or not len(glossy):
         return evaluate(points, eye, rays.direction)
     none = np.zeros_like(points.specular)
     diffuse = points._replace(specular=none, specular_edge=none)
     value = evaluate(diffuse, eye, rays.direction)
     points = take_points(points, glossy)
     terms = evaluate_specular(points, eye[glossy], rays.direction[glossy])
-    weight = _power_heuristic(
-        n_samples * rays.pdf[glossy].astype(np.float64), _n_specular(n_samples) * terms.pdf.astype(np.float64)
-    )
+    weight = _power_heuristic(shares[0] * rays.pdf[glossy].astype(np.float64), shares[1] * terms.pdf.astype(np.float64))
     lobe = points.specular * terms.base[:, None] + points.specular_edge * terms.edge[:, None]
     value[glossy] += lobe * weight
     return value
@@ -194,7 +219,7 @@ def _add_specular_rays(
     points: SurfacePoints,
     to_eye: F32,
     seed: int,
-    n_samples: int,
+    counts: list[int],
     out: F32,
 ) -> None:
     """Add what rays of the specular lobe find, weighted against the shadow rays of `_direct`."""
@@ -204,7 +229,7 @@ def _add_specular_rays(
     has_meshes = bool((lights.kind == LightKind.MESH).any())
     if not len(glossy) or not (shapes or has_meshes):
         return
-    count = _n_specular(n_samples)
+    count = _n_specular(counts)
     step = max(1, _RAYS // count)
     for first in range(0, len(glossy), step):
         chosen = glossy[first : first + step]
@@ -216,7 +241,8 @@ def _add_specular_rays(
             m = len(rays.owner)
             distance, pdf, radiance = np.zeros(m, np.float32), np.zeros(m), np.zeros((m, 3), np.float32)
             place = (rays.points.position, rays.points.shading_normal, rays.direction)
-            meet_analytic(lights, snapshot.textures, sampler.tables, light, *place, distance, pdf, radiance)
+            tables = lights, snapshot.textures, sampler.tables, sampler.guide
+            meet_analytic(*tables, light, *place, distance, pdf, radiance)
             if lights.kind[light] == LightKind.DOME:
                 if unblocked is None:
                     unblocked = transmittance(snapshot, tracer, rays.origin, rays.direction, np.inf)
@@ -227,13 +253,13 @@ def _add_specular_rays(
                 visible = transmittance(
                     snapshot, tracer, rays.origin[met], rays.direction[met], distance[met] * _STOP_SHORT
                 )
-            share = _power_heuristic(count * rays.pdf[met], n_samples * pdf[met])
+            share = _power_heuristic(count * rays.pdf[met], counts[light] * pdf[met])
             value = rays.weight[met] * radiance[met] * visible * share
             sums = np.zeros((len(chosen), 3), np.float32)
             _add(value, rays.owner[met], sums)
             out[light, chosen] += sums
         if has_meshes:
-            for light, owner, value in _mesh_hits(snapshot, tracer, sampler, rays, count, n_samples):
+            for light, owner, value in _mesh_hits(snapshot, tracer, sampler, rays, count, counts):
                 sums = np.zeros((len(chosen), 3), np.float32)
                 _add(value, owner, sums)
                 out[light, chosen] += sums
@@ -269,7 +295,7 @@ def _mesh_hits(
     sampler: LightSampler,
     rays: _SpecularRays,
     count: int,
-    n_samples: int,
+    counts: list[int],
 ) -> list[tuple[int, NDArray[np.int64], F32]]:
     """What specular rays bring from mesh lights: light, owners (ascending) and values.
 
@@ -286,7 +312,7 @@ def _mesh_hits(
         row = sampler.emissive_rows(hits.instance, hits.triangle)
         lit = np.flatnonzero(row >= 0)
         if len(lit):
-            found += _weigh_mesh_hits(snapshot, tracer, sampler, rays, ray[lit], row[lit], hits, lit, count, n_samples)
+            found += _weigh_mesh_hits(snapshot, tracer, sampler, rays, ray[lit], row[lit], hits, lit, count, counts)
         met = np.flatnonzero(hits.instance >= 0)
         if not see_through or not len(met):
             break
@@ -309,7 +335,7 @@ def _weigh_mesh_hits(
     hits: Hits,
     lit: NDArray[np.int64],
     count: int,
-    n_samples: int,
+    counts: list[int],
 ) -> list[tuple[int, NDArray[np.int64], F32]]:
     lights = snapshot.lights
     starts, direction = take_points(rays.points, ray), np.ascontiguousarray(rays.direction[ray])
@@ -317,7 +343,7 @@ def _weigh_mesh_hits(
     light = sampler.emissive_light[row]
     pdf = np.zeros(len(row))
     mesh_pdfs(lights, sampler.tables, light, row, starts.position, ends.position, pdf)
-    share = _power_heuristic(count * rays.pdf[ray], n_samples * pdf)
+    share = _power_heuristic(count * rays.pdf[ray], np.array(counts)[light] * pdf)
     value = rays.weight[ray] * ends.emission * lights.radiance[light] * share
     stop = spawn_points(snapshot, ends, -direction)
     start = rays.origin[ray]
@@ -370,7 +396,16 @@ def _shadow_rays(
     place = (*surface, first, count, seed & 0xFFFFFFFF, cosine)
     if snapshot.lights.kind[light] != LightKind.MESH:
         fill_analytic(
-            snapshot.lights, snapshot.textures, sampler.tables, light, *place, direction, distance, pdf, radiance
+            snapshot.lights,
+            snapshot.textures,
+            sampler.tables,
+            sampler.guide,
+            light,
+            *place,
+            direction,
+            distance,
+            pdf,
+            radiance,
         )
         rows = np.flatnonzero(radiance.any(axis=1))
         return _ShadowRays(rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows], None)

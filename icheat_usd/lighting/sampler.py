@@ -7,9 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from icheat_usd.kernels.environment import dome_columns_cdf
+from icheat_usd.kernels.guide import Guide
 from icheat_usd.kernels.lights import LightTables
+from icheat_usd.lighting.guide import learn_guide, no_guide
 from icheat_usd.materials import points_on_surface
-from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, Texture
+from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, SurfacePoints, Texture
+from icheat_usd.tracing import Tracer
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec.709
 
@@ -26,6 +29,7 @@ class LightSampler:
     """Distributions over the texels of domes and the triangles of mesh lights of one snapshot."""
 
     tables: LightTables
+    guide: Guide  #: from where the light of domes can be seen
     emissive_key: I64  #: (n_emissive,) ascending: instance x number of triangles + triangle
     emissive_row: I64  #: (n_emissive,) row of `Lights.triangle` with that key
     emissive_light: I32  #: (n_emissive,) light that owns each row of `Lights.triangle`
@@ -42,12 +46,22 @@ class LightSampler:
         return row
 
 
-def build_light_sampler(snapshot: SceneSnapshot) -> LightSampler:
+def build_light_sampler(
+    snapshot: SceneSnapshot, tracer: Tracer | None = None, points: SurfacePoints | None = None, seed: int = 0
+) -> LightSampler:
     """Prepare the sampling of every light.
 
     Dome texels get a probability proportional to the luminance of the bilinear image averaged
     over the texel times its solid angle; triangles of a mesh light one proportional to world
     area times mean luminance of the emission.
+
+    Parameters
+    ----------
+    tracer, points : Tracer and SurfacePoints, optional
+        With both, the sampler learns from where around these points domes can be seen, which saves
+        most of the noise in rooms with windows. Light elsewhere is as right, only noisier.
+    seed : int
+        Of the rays that learn; what is learnt depends on nothing else.
     """
     lights = snapshot.lights
     n = len(lights.kind)
@@ -61,22 +75,27 @@ def build_light_sampler(snapshot: SceneSnapshot) -> LightSampler:
     n_triangles = len(snapshot.geometry.points)
     key = lights.triangle_instance.astype(np.int64) * n_triangles + lights.triangle
     order = np.argsort(key, kind="stable")
+    tables = LightTables(
+        to_local=to_local,
+        determinant=determinant,
+        columns_begin=columns_begin,
+        columns_cdf=columns_cdf,
+        rows_begin=rows_begin,
+        rows_cdf=rows_cdf,
+        triangle_cdf=cdf,
+        triangle_corners=corners,
+        triangle_emission=emission,
+    )
+    guide = no_guide(n)
+    if tracer is not None and points is not None:
+        guide = learn_guide(snapshot, tracer, tables, points, seed)
     return LightSampler(
+        tables=tables,
+        guide=guide,
         emissive_key=key[order],
         emissive_row=order,
         emissive_light=np.repeat(np.arange(n, dtype=np.int32), np.diff(lights.triangle_begin)),
         n_triangles=n_triangles,
-        tables=LightTables(
-            to_local=to_local,
-            determinant=determinant,
-            columns_begin=columns_begin,
-            columns_cdf=columns_cdf,
-            rows_begin=rows_begin,
-            rows_cdf=rows_cdf,
-            triangle_cdf=cdf,
-            triangle_corners=corners,
-            triangle_emission=emission,
-        ),
     )
 
 

@@ -11,7 +11,7 @@ from icheat_usd.edits.field import EditField, StackCoefficients
 from icheat_usd.edits.offsets import offset_radiance
 from icheat_usd.errors import SampleSetMismatch
 from icheat_usd.kernels.relight import multiply_rows
-from icheat_usd.lighting import build_light_sampler, reflected_direct
+from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight.receivers import Receivers, group_receivers
 from icheat_usd.samples import GatherSamples, ViewSamples
@@ -173,6 +173,7 @@ def build_relighter(
     cell_light: CellLight,
     *,
     light_samples: int = 16,
+    dome_samples: int | None = None,
     seed: int = 0,
     progress: Progress = silent,
 ) -> Relighter:
@@ -182,9 +183,12 @@ def build_relighter(
     ----------
     light_samples : int
         Shadow rays per light and view sample.
+    dome_samples : int, optional
+        The same for domes; four times `light_samples` by default.
     """
     progress("light the view samples", 0.0)
-    sampler = build_light_sampler(snapshot)
-    direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, light_samples)
+    sampler = build_light_sampler(snapshot, tracer, view.points, seed)
+    counts = samples_per_light(snapshot, light_samples, dome_samples)
+    direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, counts)
     progress("light the view samples", 1.0)
     return Relighter(view, gather, transport, direct, cell_light)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,13 +141,18 @@ def gather_samples(
 
 
 def cell_direct(
-    snapshot: SceneSnapshot, tracer: Tracer, sampler: LightSampler, gather: GatherSamples, n_samples: int, seed: int
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    gather: GatherSamples,
+    n_samples: int | Sequence[int],
+    seed: int,
 ) -> F32:
     """Direct light that each cell reflects diffusely, averaged over its patch points.
 
     Parameters
     ----------
-    n_samples
+    n_samples : int or one int per light
         Shadow rays per patch point and light.
 
     Returns

@@ -184,6 +184,7 @@ class Session:
             self.transport,
             self.cell_light,
             light_samples=quality.light_samples,
+            dome_samples=quality.dome_samples,
             seed=quality.seed,
             progress=self.progress,
         )

@@ -19,6 +19,7 @@ class Quality:
     rays_per_bounce_row: int = 128
     row_spacing: int = 1  #: pixels between the points where rows are kept; the rest is interpolated
     light_samples: int = 16  #: shadow rays per light and point
+    dome_samples: int | None = None  #: for the direct light of domes in the image; 4 `light_samples` by default
     n_bounces: int = 16  #: diffuse reflections before the last one
     samples_per_pixel: int = 1
     seed: int = 0

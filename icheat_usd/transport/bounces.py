@@ -133,6 +133,7 @@ def light_cells(
         Shadow rays per light and patch point.
     """
     progress("light the gather samples", 0.0)
-    direct = cell_direct(snapshot, tracer, build_light_sampler(snapshot), gather, light_samples, seed)
+    sampler = build_light_sampler(snapshot, tracer, gather.patch_points, seed)
+    direct = cell_direct(snapshot, tracer, sampler, gather, light_samples, seed)
     progress("solve the bounces", 0.0)
     return CellLight(direct, solve_bounces(bounces, direct, n_bounces))

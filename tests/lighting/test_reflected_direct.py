@@ -128,7 +128,8 @@ ANALYTIC = [
 @pytest.mark.parametrize("light", ANALYTIC, ids=lambda light: light.kind.name)
 def test_rays_meet_lights_where_and_as_probably_as_they_are_sampled(light: Light) -> None:
     snapshot = scene(light)
-    tables = build_light_sampler(snapshot).tables
+    sampler = build_light_sampler(snapshot)
+    tables = sampler.tables
     place = (0.1, 0.0, -0.1, *UP)
     shape = light_shape(snapshot.lights, snapshot.textures, tables, 0)
     distributions = snapshot.textures.texels, tables.rows_cdf, tables.columns_cdf
@@ -142,6 +143,7 @@ def test_rays_meet_lights_where_and_as_probably_as_they_are_sampled(light: Light
         snapshot.lights,
         snapshot.textures,
         tables,
+        sampler.guide,
         0,
         at,
         np.tile(np.float32(UP), (n, 1)),
