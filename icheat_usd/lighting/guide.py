@@ -26,11 +26,11 @@ _POINTS = 1 << 15  # that vote for the leaves: more only make the tree slower to
 _LEAVES = 512  # places that are told apart; with normals about three times as many densities
 _GROUPS_AT_ONCE = 128  # densities learnt together: a quarter of a million rays
 
-_RAYS = 2  # per cell of a plane, from as many points of the place
+_RAYS = 3  # per cell of a plane, from as many points of the place
 
 # Share of a guided image dome's samples that stays proportional to the image: what the few pilot rays
 # of a cell missed is still found.
-_PLAIN_SHARE = 0.1
+_PLAIN_SHARE = 0.15
 
 # Share of a density that comes from the leaves around: a pilot of one ray a cell is a noisy witness.
 _AROUND = 0.25
