@@ -366,14 +366,14 @@ def closed_box(albedo: ArrayLike = 0.5, emission: ArrayLike = 0.0, *, size: floa
     return make_snapshot([mesh], camera=look_at((0, 0, 0), (0, 0, -1), fov=90))
 
 
-def cornell(width: int = 32, height: int = 32, *, emission: ArrayLike = (17, 12, 4)) -> SceneSnapshot:
-    """Box of side 2 about the origin, open to +Z, red at -X and green at +X, two blocks, a square lamp ``/lamp``."""
+def cornell_meshes() -> list[Mesh]:
+    """Box of side 2 about the origin, open to +Z, red at -X and green at +X, and two blocks."""
     white = Material(diffuse=0.73)
     red, green = Material(diffuse=(0.65, 0.05, 0.05)), Material(diffuse=(0.12, 0.45, 0.15))
     walls = box(2, inward=True)
     tall = translation(-0.35, -0.4, -0.3) @ rotation((0, 1, 0), 17)
     low = translation(0.35, -0.7, 0.35) @ rotation((0, 1, 0), -17)
-    meshes = [
+    return [
         Mesh(walls[0:2], red, path="/red"),
         Mesh(walls[2:4], green, path="/green"),
         Mesh(walls[4:6], white, path="/floor"),
@@ -381,10 +381,41 @@ def cornell(width: int = 32, height: int = 32, *, emission: ArrayLike = (17, 12,
         Mesh(walls[8:10], white, path="/back"),
         Mesh(box((0.6, 1.2, 0.6)), white, transforms=[tall], path="/tall"),
         Mesh(box((0.6, 0.6, 0.6)), white, transforms=[low], path="/low"),
-        Mesh(quad(0.5)[:, ::-1], Material(0.0, emission), transforms=[translation(0, 0.995, 0)], path="/lamp"),
     ]
+
+
+def cornell(width: int = 32, height: int = 32, *, emission: ArrayLike = (17, 12, 4)) -> SceneSnapshot:
+    """`cornell_meshes` and a square lamp ``/lamp`` that shines to both sides."""
+    lamp = Mesh(quad(0.5)[:, ::-1], Material(0.0, emission), transforms=[translation(0, 0.995, 0)], path="/lamp")
     camera = look_at((0, 0, 3.9), (0, 0, 0), fov=39.3, width=width, height=height)
-    return make_snapshot(meshes, camera=camera)
+    return make_snapshot([*cornell_meshes(), lamp], camera=camera)
+
+
+def covered_cornell(
+    lamp: str = "mesh",
+    lights: Sequence[Light] = (),
+    *,
+    width: int = 20,
+    height: int = 20,
+    emission: ArrayLike = (17, 12, 4),
+) -> SceneSnapshot:
+    """`cornell` with a black cover ``/cover`` over its lamp: a ``"mesh"``, a ``"rect"`` light, or ``"none"`` of both.
+
+    The cover keeps the back of the lamp from lighting the ceiling at a distance of millimetres, where sampling
+    the lamp by its area does not converge in the time of a test. The rect light lies a hair before it, so that
+    in a renderer where rect lights are shapes it blocks nothing more.
+    """
+    geometry = cornell_meshes()
+    if lamp != "none":
+        geometry.append(Mesh(quad(0.6)[:, ::-1], Material(0.0), transforms=[translation(0, 0.99, 0)], path="/cover"))
+    if lamp == "mesh":
+        shining = Material(0.0, emission)
+        geometry.append(Mesh(quad(0.5)[:, ::-1], shining, transforms=[translation(0, 0.985, 0)], path="/lamp"))
+    elif lamp == "rect":
+        place = translation(0.02, 0.985, 0.03) @ rotation((1, 0, 0), -90)
+        lights = (Light(LightKind.RECT, emission, place, (0.5, 0.4)), *lights)
+    camera = look_at((0, 0, 3.9), (0, 0, 0), fov=39.3, width=width, height=height)
+    return make_snapshot(geometry, lights=lights, camera=camera)
 
 
 def soup(n: int = 300, seed: int = 0, *, material: Material | None = None, size: float = 0.3) -> Mesh:
