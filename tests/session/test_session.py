@@ -210,3 +210,28 @@ def test_unusable_stages_give_one_clear_error(tmp_path, content, complaint):
         path.write_text(content)
     with pytest.raises(StageError, match=complaint):
         Session.open(path, quality=DRAFT).relight()
+
+
+@pytest.mark.parametrize("placing", ["moved by 10 km", "in millimetres", "in kilometres"])
+def test_where_and_in_which_unit_a_room_stands_does_not_matter(tmp_path, placing):
+    """The same floats but for rounding, hence the same rays: only a ray at an edge may fall on the other side."""
+    room = {
+        "moved by 10 km": ROOM.replace(
+            'def Xform "World"\n{',
+            'def Xform "World"\n{\n    double3 xformOp:translate = (10000, -300, 10000)\n'
+            '    uniform token[] xformOpOrder = ["xformOp:translate"]',
+        ),
+        "in millimetres": ROOM.replace("metersPerUnit = 1\n", "metersPerUnit = 0.001\n"),
+        "in kilometres": ROOM.replace("metersPerUnit = 1\n", "metersPerUnit = 1000\n"),
+    }[placing]
+    assert room != ROOM
+    films = []
+    for name, text in (("here", ROOM), ("there", room)):
+        (tmp_path / f"{name}.usda").write_text(text)
+        session = Session.open(tmp_path / f"{name}.usda", width=24, height=18, quality=QUALITY)
+        films.append((session.relight(), session.render(GatherSettings(1, 16, 4))))
+    for here, there in zip(*films, strict=True):
+        ours, theirs = here.layer("beauty").mean(axis=2), there.layer("beauty").mean(axis=2)
+        assert ours.mean() > 0.05
+        assert np.quantile(np.abs(theirs / ours - 1), 0.95) < 0.01
+        assert theirs.mean() == pytest.approx(ours.mean(), rel=5e-3)
