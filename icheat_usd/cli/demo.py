@@ -28,7 +28,7 @@ _LAYER = """#usda 1.0
 
 def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", default="demo_output", metavar="FOLDER", help="default demo_output")
-    parser.add_argument("--width", type=positive, default=256, metavar="PIXELS", help="default 256; height follows")
+    parser.add_argument("--width", type=positive, default=400, metavar="PIXELS", help="default 400; height follows")
     parser.add_argument("--preview-only", action="store_true", help="leave out the final gather")
     add_json(parser)
 
@@ -55,7 +55,7 @@ def command(options: argparse.Namespace) -> int:
     images: list[str] = []
     seconds: dict[str, float] = {}
     with ProgressLine() as progress:
-        quality = Quality(n_gather=16_384, rays_per_row=192, rays_per_bounce_row=96)
+        quality = Quality(n_gather=32_768, rays_per_row=256, rays_per_bounce_row=128)
         height = round(options.width * 3 / 4)
         session = Session.open(layer, width=options.width, height=height, quality=quality, progress=progress)
 
@@ -92,7 +92,7 @@ def command(options: argparse.Namespace) -> int:
         ratio = None
         if not options.preview_only:
             began = time.perf_counter()
-            final = session.render(GatherSettings(samples_per_pixel=1, gather_rays=64))
+            final = session.render(GatherSettings(samples_per_pixel=4, gather_rays=48))
             seconds["final gather"] = time.perf_counter() - began
             save(final, "final_after")
             ratio = float(mean_ratio(after.layers["beauty"], final.layers["beauty"]))
