@@ -119,7 +119,7 @@ def sphere(text: str) -> tuple[float, ...]:
 
 def add_command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.authoring import open_for_writing
-    from icheat_usd.session import Session
+    from icheat_usd.session import authoring, inspection
     from icheat_usd.stage.authoring import Members
 
     stage, layer = open_for_writing(options)
@@ -132,20 +132,19 @@ def add_command(options: argparse.Namespace) -> int:
             values[name] = getattr(options, name)
     if options.sidecar is not None:
         values["sidecar"] = options.sidecar
-    session = Session.open(stage, camera=options.camera, frame=options.frame, stack=options.stack)
-    for side in ("receiver", "caster"):
-        numbers = getattr(options, f"{side}_sphere")
-        if numbers is not None:
-            values[f"{side}_brush"] = _brush(session, numbers)
-    path = session.add_edit(
-        options.name,
-        layer=layer,
-        parameters=dict(options.set or ()),
-        frame=options.frame,
-        before=options.before,
-        after=options.after,
-        **values,
-    )
+    values |= {"layer": layer, "parameters": dict(options.set or ()), "frame": options.frame}
+    values |= {"before": options.before, "after": options.after}
+    spheres = {side: getattr(options, f"{side}_sphere") for side in ("receiver", "caster")}
+    if any(spheres.values()):
+        # Painting needs the scene; an edit between whole prims does not, and works in a host without the kernels.
+        from icheat_usd.session import Session
+
+        session = Session.open(stage, camera=options.camera, frame=options.frame, stack=options.stack)
+        values |= {f"{side}_brush": _brush(session, numbers) for side, numbers in spheres.items() if numbers}
+        path = session.add_edit(options.name, **values)
+    else:
+        stack = inspection.find_stack(stage, options.stack, options.camera)
+        path = authoring.add_edit(stage, stack, options.name, **values)
     if options.json:
         print_json({"edit": path, "layer": layer})
     else:

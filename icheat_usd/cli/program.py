@@ -66,6 +66,10 @@ def run(arguments: list[str] | None = None) -> int:
         return _fail(options, str(error))
     except OSError as error:
         return _fail(options, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except ModuleNotFoundError as error:
+        return _fail(
+            options, f"this needs the package '{error.name}', which is not installed here; pip install {error.name}"
+        )
     except MemoryError:
         return _fail(options, "out of memory; lower --width and --height or the quality")
     except Exception as error:

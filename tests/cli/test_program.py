@@ -270,3 +270,16 @@ def test_tree_names_the_layer_behind_each_value(edited: Path, capsys: pytest.Cap
 def _in_a_scratch_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     monkeypatch.chdir(tmp_path)
     return lambda: None
+
+
+def test_a_package_that_a_host_lacks_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def command(options: argparse.Namespace) -> int:
+        raise ModuleNotFoundError("No module named 'numba'", name="numba")
+
+    monkeypatch.setattr("icheat_usd.cli.check.command", command)
+    assert main(["check", "stage.usda"]) == 2
+    assert capsys.readouterr().err == (
+        "icheat: error: this needs the package 'numba', which is not installed here; pip install numba\n"
+    )
