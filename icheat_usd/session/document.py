@@ -31,8 +31,8 @@ class Session:
     """One stage seen by one camera at one time, with one edit stack.
 
     Make one with `Session.open`. What is expensive (snapshot, samples,
-    transport) is made when first needed and kept until `close` or until the
-    stage's geometry, lights or camera change (`reload`).
+    transport) is made when first needed and kept: edits are read anew each
+    time, but after a change of geometry, lights or camera open a new session.
     """
 
     def __init__(

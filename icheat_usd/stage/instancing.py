@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Tf, Usd, UsdGeom
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from icheat_usd.scene import F64, I64
 from icheat_usd.stage.placing import GeometryBuilder, relative_matrix
@@ -102,11 +103,16 @@ class InstancerReader:
             count = 0 if positions is None else len(positions)
             self._report(prim, "point instancer", f"it has {n} protoIndices and {count} positions; left out.")
             return None
+        mismatched = set()
         for name in ("orientations", "orientationsf", "scales", "velocities", "accelerations", "angularVelocities"):
             attribute = prim.GetAttribute(name)
             values = attribute.Get(time) if attribute else None
             if values and len(values) != n:
                 self._report(prim, name, f"{name} has {len(values)} values for {n} instances; ignored.")
+                mismatched.add(name)
+        if mismatched:
+            # USD itself would read past the end of the short array (seen in 26.11) and give what memory holds there.
+            return _placed_without(instancer, time, positions, mismatched)
         # With prototype transforms included USD gives up altogether where one index is wrong.
         try:
             matrices = instancer.ComputeInstanceTransformsAtTime(
@@ -197,3 +203,23 @@ class InstancerReader:
 
 def _relative_path(prim: Usd.Prim, root: Usd.Prim) -> str:
     return str(prim.GetPath().MakeRelativePath(root.GetPath()))
+
+
+def _placed_without(
+    instancer: UsdGeom.PointInstancer, time: Usd.TimeCode, positions: Vt.Vec3fArray, left_out: set[str]
+) -> F64:
+    """Row-vector transforms from positions, and from those of scales and orientations that are not left out."""
+    prim = instancer.GetPrim()
+
+    def values(name: str) -> Any:
+        attribute = prim.GetAttribute(name)
+        return attribute.Get(time) if attribute and name not in left_out else None
+
+    scales, turns = values("scales"), values("orientationsf") or values("orientations")
+    matrices = np.empty((len(positions), 4, 4))
+    for i, position in enumerate(positions):
+        matrix = Gf.Matrix4d(1).SetScale(Gf.Vec3d(scales[i])) if scales else Gf.Matrix4d(1)
+        if turns:
+            matrix *= Gf.Matrix4d().SetRotate(Gf.Quatd(turns[i]))
+        matrices[i] = np.array(matrix * Gf.Matrix4d().SetTranslate(Gf.Vec3d(position)))
+    return matrices

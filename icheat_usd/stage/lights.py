@@ -110,7 +110,7 @@ def read_mesh_factors(prims: Iterable[Usd.Prim], time: Usd.TimeCode | float | No
         Modes other than "materialGlowTintsLight" have no factor; `read_lights` reports them.
     """
     code = time_code(time)
-    reader = _Reader(code, Placement(1.0, np.zeros(3), code), TextureLibrary())
+    reader = _Reader(code, Placement(1.0, np.zeros(3)), TextureLibrary())
     return {
         str(prim.GetPath()): reader.radiance(prim, None, 1.0)
         for prim in prims

@@ -92,7 +92,7 @@ def take_snapshot(
         meters_per_unit = _meters_per_unit(stage, report)
         bounds = builder.bounds()
         middle = np.zeros(3) if bounds is None else 0.5 * (bounds[0] + bounds[1])
-        placement = Placement(meters_per_unit, middle * meters_per_unit, when)
+        placement = Placement(meters_per_unit, middle * meters_per_unit)
         if bounds is None:
             report("/", "geometry", "the stage shows no geometry at this time; check visibility, purpose and payloads.")
         geometry = builder.build(placement)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf
 
 from icheat_usd.scene import F64
 
@@ -40,13 +40,10 @@ class Placement:
         Metres per scene unit of the stage.
     centre : (3,) float64, metres
         Subtracted from every position.
-    time
-        Time code at which `of_prim` reads transforms.
     """
 
     meters_per_unit: float
     centre: F64
-    time: Usd.TimeCode = field(default_factory=Usd.TimeCode.EarliestTime)
 
     def matrix(self, local_to_world: Gf.Matrix4d) -> F64:
         """A local-to-world matrix in stage units as ``(3, 4) float64`` from local units to metres about the centre."""
@@ -57,7 +54,3 @@ class Placement:
         placed = transforms * self.meters_per_unit
         placed[..., 3] -= self.centre
         return placed
-
-    def of_prim(self, prim: Usd.Prim, time: Usd.TimeCode | None = None) -> F64:
-        """Local-to-world of one prim, as `matrix` gives it."""
-        return self.matrix(UsdGeom.XformCache(self.time if time is None else time).GetLocalToWorldTransform(prim))
