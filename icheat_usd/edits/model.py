@@ -12,10 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from icheat_usd.edits.encodings.rows import SampledRows
 
 #: A parameter value: number, flag, token, or colour / vector as a tuple of floats.
 Value = float | bool | str | tuple[float, ...]
@@ -47,11 +50,14 @@ class SurfaceMask:
     `texels` is (n_faces of all surfaces, resolution, resolution) float32 in
     [0, 1]; texel [f, y, x] is centred at face coordinates
     ((x + 1/2) / resolution, (y + 1/2) / resolution), bilinear in between and
-    clamped at the face's border.
+    clamped at the face's border. `rest` says where the faces lay when they
+    were painted, so that weights find their place again on a mesh whose
+    topology has changed: object space, at the texel centres of resolution 2.
     """
 
     surfaces: tuple[MaskedSurface, ...]
     texels: NDArray[np.float32]
+    rest: NDArray[np.float32] | None = None  #: (n_faces, 2, 2, 3), stage units
 
     @property
     def resolution(self) -> int:
@@ -62,8 +68,10 @@ class SurfaceMask:
 class Payload:
     """Painted and baked data of one edit at one key; immutable, named by its digest.
 
-    `scale_delta` is the baked rank-1 form, the RGB of s - 1 that the masks
-    multiply; it serves readers that do not know `operation`.
+    What is baked serves readers that do not know `operation`. `scale_delta`,
+    `emission` and `offset` are the rank-1 form: the RGB of s - 1, e and o, the
+    same for all pairs, that the masks multiply. `rows` is the sampled form, in
+    which the masks are already multiplied.
     """
 
     operation: str
@@ -71,15 +79,73 @@ class Payload:
     receiver_mask: SurfaceMask | None = None
     caster_mask: SurfaceMask | None = None
     scale_delta: tuple[float, float, float] | None = None
+    emission: tuple[float, float, float] | None = None  #: radiance
+    offset: tuple[float, float, float] | None = None  #: 1 / m^2, not multiplied by the receiver's albedo
+    rows: SampledRows | None = None
     made_against: Mapping[str, str | float | int] = field(default_factory=lambda: MappingProxyType({}))
     unknown: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True)
-class Selection:
-    """One side of an edit: the surfaces its collection includes, by scene path."""
+class SurfacesAt:
+    """Surfaces by scene path: weight 1 on them."""
 
     paths: frozenset[str]
+
+
+@dataclass(frozen=True)
+class SurfacesOf:
+    """Weight 1 where one of these materials is bound, by path; a face's own binding counts."""
+
+    materials: frozenset[str]
+
+
+class Shape(StrEnum):
+    """Form of a region in its own space."""
+
+    BOX = "box"  #: [-1, 1]^3
+    SPHERE = "sphere"  #: of radius 1
+
+
+@dataclass(frozen=True)
+class Region:
+    """Weight 1 inside a box or a sphere, falling smoothly to 0 at its border.
+
+    The fall takes `softness` of the way from the centre to the border: 0 is a
+    hard border, 1 falls from the centre on.
+    """
+
+    shape: Shape
+    to_shape: tuple[float, ...]  #: 12 numbers, rows of a (3, 4) matrix: metres, stage axes, to the shape's own space
+    softness: float = 0.0
+
+
+class Rule(StrEnum):
+    """Set algebra on soft weights."""
+
+    INTERSECTION = "intersection"  #: product
+    UNION = "union"  #: 1 - product of (1 - w)
+    DIFFERENCE = "difference"  #: the first times the product of (1 - w) of the others
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Several parts under one rule; without parts it selects nothing."""
+
+    rule: Rule
+    parts: tuple[Limit, ...]
+
+
+#: What narrows a selection beyond its collection.
+Limit = SurfacesAt | SurfacesOf | Region | Combination
+
+
+@dataclass(frozen=True)
+class Selection:
+    """One side of an edit: the surfaces its collection includes, times every limit (and the payload's mask)."""
+
+    paths: frozenset[str]
+    limits: tuple[Limit, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +165,8 @@ class Edit:
     `keys` is empty for an edit that needs no payload, else one or two whose
     weights sum to 1. `parameters` are authored opinions over the payload's
     recipe over schema fallbacks, mixed over the keys; each key's payload has
-    its own.
+    its own. Points, directions and lengths among them are in metres and stage
+    axes; `target` stands for the point parameter of that name.
     """
 
     path: str
@@ -112,6 +179,8 @@ class Edit:
     enabled: bool = True
     keys: tuple[KeyedPayload, ...] = ()
     occluders: tuple[str, ...] = ()
+    lights: tuple[str, ...] = ()  #: paths of the lights whose light the scale acts on; empty means all
+    target: tuple[float, float, float] | None = None
 
     @property
     def name(self) -> str:
