@@ -22,7 +22,8 @@ from icheat_usd.session import authoring, films
 from icheat_usd.session.quality import FINAL, PREVIEW, Quality
 from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
-from icheat_usd.stage.edit_stack import find_stack, read_edit_stack
+from icheat_usd.stage.edit_stack import read_edit_stack
+from icheat_usd.stage.stacks import find_stack
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import CellLight, Transport, build_bounces, build_transport, light_cells
 

@@ -29,7 +29,8 @@ from icheat_usd.stage.authoring import (
     set_payload_key,
 )
 from icheat_usd.stage.check import check_stage
-from icheat_usd.stage.edit_stack import describe_edit, read_edit_stack
+from icheat_usd.stage.description import describe_edit
+from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.stage.keys import read_keys
 from tests.stage.edit_stages import DIGEST, OTHER, SURFACES, THIRD, RecordingReader, layer, shot_stage, stock_findings
 

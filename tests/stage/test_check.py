@@ -13,7 +13,7 @@ from icheat_usd.errors import SidecarError
 from icheat_usd.stage import schema
 from icheat_usd.stage.authoring import add_edit, create_stack, remove_edit, set_payload_key
 from icheat_usd.stage.check import RULES, check_stage
-from icheat_usd.stage.edit_stack import Severity
+from icheat_usd.stage.stacks import Severity
 from tests.stage.edit_stages import DIGEST, OTHER, RecordingReader, layer, python, shot_stage
 
 WARM = "/World/indirect/warm"

@@ -21,7 +21,9 @@ from icheat_usd.stage.authoring import (
     set_edit,
     set_payload_key,
 )
-from icheat_usd.stage.edit_stack import describe_edit, find_stack, read_edit_stack
+from icheat_usd.stage.description import describe_edit
+from icheat_usd.stage.edit_stack import read_edit_stack
+from icheat_usd.stage.stacks import find_stack
 from tests.stage.edit_stages import DIGEST, OTHER, SURFACES, RecordingReader, layer, python, shot_stage
 
 STACK = "/World/indirect"
@@ -385,7 +387,9 @@ import json, sys
 from icheat_usd.edits.model import Payload
 from icheat_usd.stage import schema
 from icheat_usd.stage.check import check_stage
-from icheat_usd.stage.edit_stack import describe_edit, find_stack, read_edit_stack
+from icheat_usd.stage.description import describe_edit
+from icheat_usd.stage.edit_stack import read_edit_stack
+from icheat_usd.stage.stacks import find_stack
 stage = Usd.Stage.Open(sys.argv[1])
 path = find_stack(stage)
 read = lambda file, source, digest, anchor: Payload("scale", {"gain": 3.0})
