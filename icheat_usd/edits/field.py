@@ -1,90 +1,141 @@
-"""A stack bound to a scene: masks at surface points, and the composed pair functions S, E and O."""
+"""A stack bound to a scene: the composed pair functions S, E and O, and what aggregates and views add to them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from icheat_usd.edits import operations
-from icheat_usd.edits.model import Blend, Edit, EditStack, Selection, SurfaceMask, Value
-from icheat_usd.edits.operations import Operation, PairCoefficients, Pairs
+from icheat_usd.edits.model import Blend, Edit, EditStack, Payload, Selection, Value
+from icheat_usd.edits.operations import Level, Measure, Operation, PairCoefficients, PairEnd, Pairs
+from icheat_usd.edits.operations.division import divide
+from icheat_usd.edits.selection import BoundSelection, bind_selection
 from icheat_usd.errors import EditError
-from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I64, Bool, Finding, SceneSnapshot, SurfacePoints
+
+ONE = np.float32(1)
+_NOWHERE = PairEnd(*(np.zeros((1, 3), np.float32),) * 3)
+
+
+class Ends(NamedTuple):
+    """n points as the edits see them: receivers, or casters."""
+
+    masks: F32  #: (n_rows, n) weights: one row per edit and key, in the order of the edits
+    place: PairEnd | None  #: (n, 3) each; None where no edit asks
+    located: tuple[Any, ...]  #: for every key that is baked as rows: where its samples are looked up
+
+    def take(self, which: I64) -> Ends:
+        """Some of the points, in the order of `which`."""
+        place = None if self.place is None else PairEnd(*(np.take(column, which, axis=0) for column in self.place))
+        return Ends(np.take(self.masks, which, axis=1), place, tuple(_taken(entry, which) for entry in self.located))
+
+
+def _taken(entry: Any, which: I64) -> Any:
+    if isinstance(entry, tuple):
+        return type(entry)(*(np.take(column, which, axis=0) for column in entry))  # type: ignore[call-arg]
+    return np.take(entry, which, axis=0)
 
 
 class StackCoefficients(NamedTuple):
-    """The composed pair functions at n pairs: ``t (scale b + emission) + A offset b``."""
+    """The composed pair functions at n pairs, for G groups of lights.
 
-    scale: F32  #: (n, 3)
+    A pair's light is ``t (sum_g scale_g b_g + emission) + A sum_g offset_g b_g``. `through` holds, for each edit of `EditField.throughs`, the factor on light
+    that its occluders hold back; None is 0 everywhere.
+    """
+
+    scale: F32  #: (G, n, 3)
     emission: F32  #: (n, 3)
-    offset_diffuse: F32 | None  #: (n, 3) to be multiplied by the receiver's albedo; None is 0
-    offset_paint: F32 | None  #: (n, 3) not to be; None is 0
+    offset_diffuse: F32 | None  #: (G, n, 3) to be multiplied by the receiver's albedo; None is 0
+    offset_paint: F32 | None  #: (G, n, 3) not to be; None is 0
+    through: tuple[F32 | None, ...]  #: (G, n, 3) each
+
+    def light(self, b: F32) -> F32:
+        """What the casters send to the receivers in sight, per unit of transport: (n, 3) from (G, n, 3)."""
+        return weighted(self.scale, b) + self.emission
 
 
-@dataclass(frozen=True, eq=False)
-class BoundMask:
-    """Weights of one selection on the surfaces of one scene."""
-
-    member: F32  #: (n_instances,) 1 where the collection includes the instance's surface
-    mask: SurfaceMask | None
-    first_face: I64  #: (n_instances,) first row of the mask's texels, -1 where it has none
-
-    def at(self, points: SurfacePoints) -> F32:
-        """Weights of the points, (n,) in [0, 1]; 0 where a point is no hit."""
-        hit = points.instance >= 0
-        instance = np.where(hit, points.instance, 0)
-        weights = np.where(hit, self.member[instance], np.float32(0)).astype(np.float32)
-        if self.mask is None:
-            return weights
-        first = self.first_face[instance]
-        painted = (weights > 0) & (first >= 0)
-        result = np.zeros(len(weights), np.float32)
-        rows = first[painted] + points.face[painted]
-        result[painted] = weights[painted] * _bilinear(self.mask.texels, rows, points.face_uv[painted])
-        return result
+def weighted(factor: F32, b: F32) -> F32:
+    """Sum over groups of lights of factor x b: (n, 3) from two (G, n, 3)."""
+    total = factor[0] * b[0]
+    for group in range(1, len(b)):
+        total += factor[group] * b[group]
+    return total
 
 
-def _bilinear(texels: F32, rows: I64, uv: F32) -> F32:
-    resolution = texels.shape[1]
-    place = np.clip(uv * np.float32(resolution) - np.float32(0.5), 0, resolution - 1)
-    low = np.minimum(place.astype(np.int64), max(resolution - 2, 0))
-    high = np.minimum(low + 1, resolution - 1)
-    f = (place - low).astype(np.float32)
-    x0, y0, x1, y1 = low[:, 0], low[:, 1], high[:, 0], high[:, 1]
-    top = texels[rows, y0, x0] * (1 - f[:, 0]) + texels[rows, y0, x1] * f[:, 0]
-    bottom = texels[rows, y1, x0] * (1 - f[:, 0]) + texels[rows, y1, x1] * f[:, 0]
-    return (top * (1 - f[:, 1]) + bottom * f[:, 1]).astype(np.float32)
+class Aggregate(NamedTuple):
+    """One key of an edit that acts on all light from its casters: `resolve` it before evaluating beyond its edit."""
+
+    edit: int
+    key: int
+    row: int  #: of the masks
 
 
 @dataclass(frozen=True, eq=False)
 class BoundEdit:
-    """An edit that knows the scene: its operation, and parameters, masks and a weight for each key."""
+    """An edit that knows the scene; tuples have one entry per key."""
 
     edit: Edit
-    operation: Operation | None  #: None: unknown here, `baked` is used
-    parameters: tuple[dict[str, Value], ...]
-    baked: tuple[F32, ...]  #: scale - 1, baked by who authored it; unused where the operation is known
-    receivers: tuple[BoundMask, ...]
-    casters: tuple[BoundMask, ...]
+    operation: Operation | None  #: None: unknown here, what is baked is used
+    parameters: tuple[Mapping[str, Value], ...]
+    baked: tuple[PairCoefficients | None, ...]  #: used where the operation is unknown and there are no rows
+    rows: tuple[Any | None, ...]  #: BoundRows, used where the operation is unknown
+    receivers: tuple[BoundSelection, ...]
+    casters: tuple[BoundSelection, ...]
     key_weights: tuple[float, ...]
+    groups: Bool  #: (G,) groups of lights that the scale acts on
+    occluders: Bool  #: (n_instances,) what light passes through
 
-    def evaluate(self, key: int, incident: F32) -> PairCoefficients:
-        """Coefficients at full amount and masks, as of one key."""
-        if self.operation is None:
-            return PairCoefficients(scale=np.float32(1) + self.baked[key][None, :])
-        return self.operation.evaluate(self.parameters[key], Pairs(incident))
+    @property
+    def level(self) -> Level:
+        return Level.PAIR if self.operation is None else self.operation.level
+
+    @property
+    def n_keys(self) -> int:
+        return len(self.key_weights)
+
+    @property
+    def offset_is_paint(self) -> bool:
+        return self.operation is None or not self.operation.offset_times_albedo
+
+    def evaluate(self, key: int, pairs: Pairs, receivers: Any, casters: Any) -> PairCoefficients:
+        """Pair coefficients at full amount and masks, as of one key.
+
+        `receivers` and `casters` are the key's entries of `Ends.located`, if it is baked as rows.
+        """
+        if self.operation is not None:
+            return self.operation.evaluate(self.parameters[key], pairs)
+        if self.rows[key] is not None:
+            result: PairCoefficients = self.rows[key].evaluate(receivers, casters)  # type: ignore[union-attr]
+            return result
+        baked = self.baked[key]
+        assert baked is not None
+        return baked
+
+    def view(self, key: int) -> tuple[F32, F32]:
+        """Scale and offset of an edit at level VIEW, (3,) each."""
+        assert self.operation is not None
+        return self.operation.evaluate_view(self.parameters[key])
 
 
 @dataclass(frozen=True, eq=False)
 class EditField:
     """The active edits of a stack on one scene, weakest first.
 
-    Masks come as rows: one per edit and key, in the order of the edits.
+    Use: `receivers` and `casters` once for all points, `Ends.take` to form
+    pairs, `evaluate` on these. Where `aggregates` has entries, each is resolved
+    in turn from the light of its casters as the weaker edits leave it; its
+    scales are then given to `evaluate`. `finish` applies what acts on views.
     """
 
     edits: tuple[BoundEdit, ...]
+    light_group: I64  #: (n_lights,) group of each light; edits tell groups apart, never lights within one
+    n_groups: int = 1
+    findings: tuple[Finding, ...] = ()
+
+    # What a renderer has to provide
 
     @property
     def is_identity(self) -> bool:
@@ -96,98 +147,307 @@ class EditField:
         return any(bound.operation is not None and bound.operation.uses_incident for bound in self.edits)
 
     @property
+    def uses_receiver(self) -> bool:
+        """True if coefficients depend on the receiver by more than its masks, so that receivers cannot share them."""
+        return any(
+            any(rows is not None for rows in bound.rows) if bound.operation is None else bound.operation.uses_receiver
+            for bound in self.edits
+        )
+
+    @property
+    def uses_caster(self) -> bool:
+        """True if coefficients depend on the caster by more than its masks and light."""
+        return any(bound.operation is not None and bound.operation.uses_caster for bound in self.edits)
+
+    @property
     def has_offset(self) -> bool:
-        """True if an operation may give offsets, which reach receivers through occluders."""
-        return any(bound.operation is not None and bound.operation.has_offset for bound in self.edits)
+        """True if an edit may give offsets, which reach receivers through occluders."""
+        return any(
+            _bakes_offset(bound) if bound.operation is None else bound.operation.has_offset for bound in self.edits
+        )
+
+    @property
+    def throughs(self) -> tuple[int, ...]:
+        """Edits whose occluders let light through."""
+        return tuple(
+            i for i, bound in enumerate(self.edits) if bound.operation is not None and bound.operation.has_through
+        )
+
+    @property
+    def aggregates(self) -> tuple[Aggregate, ...]:
+        """Keys at level AGGREGATE in the order in which they must be resolved."""
+        found, row = [], 0
+        for index, bound in enumerate(self.edits):
+            if bound.level is Level.AGGREGATE:
+                found += [Aggregate(index, key, row + key) for key in range(bound.n_keys)]
+            row += bound.n_keys
+        return tuple(found)
 
     @property
     def n_rows(self) -> int:
-        return sum(len(bound.receivers) for bound in self.edits)
+        return sum(bound.n_keys for bound in self.edits)
+
+    # Points
+
+    def receivers(self, points: SurfacePoints) -> Ends:
+        """The points as receivers."""
+        masks = [selection.at(points) for bound in self.edits for selection in bound.receivers]
+        located = [rows.locate_receivers(points) for bound in self.edits for rows in bound.rows if rows is not None]
+        return _ends(masks, located, points, self.uses_receiver)
+
+    def casters(self, points: SurfacePoints) -> Ends:
+        """The points as casters."""
+        masks = [selection.at(points) for bound in self.edits for selection in bound.casters]
+        located = [rows.locate_casters(points) for bound in self.edits for rows in bound.rows if rows is not None]
+        return _ends(masks, located, points, self.uses_receiver or self.uses_caster)
 
     def receiver_masks(self, points: SurfacePoints) -> F32:
-        """Soft receiver masks u at the points, (n_rows, n)."""
-        return self._rows([mask.at(points) for bound in self.edits for mask in bound.receivers], points)
+        """Soft receiver masks u alone, (n_rows, n)."""
+        return self.receivers(points).masks
 
-    def caster_masks(self, points: SurfacePoints) -> F32:
-        """Soft caster masks w at the points, (n_rows, n)."""
-        return self._rows([mask.at(points) for bound in self.edits for mask in bound.casters], points)
+    # Pairs
 
-    def _rows(self, rows: list[F32], points: SurfacePoints) -> F32:
-        return np.stack(rows) if rows else np.zeros((0, len(points.instance)), np.float32)
-
-    def evaluate(self, incident: F32, receiver: F32, caster: F32) -> StackCoefficients:
+    def evaluate(
+        self,
+        b: F32,
+        receivers: Ends,
+        casters: Ends,
+        resolved: Sequence[F32] = (),
+        upto: int | None = None,
+    ) -> StackCoefficients:
         """Compose the stack at n pairs (DESIGN, Semantics).
 
         Parameters
         ----------
-        incident : (n, 3) float32, radiance, scene-linear
-            Unedited light `b` that the caster sends to the receiver.
-        receiver : (n_rows, n) or (n_rows, 1) float32
-            Receiver masks u.
-        caster : (n_rows, n) float32
-            Caster masks w.
+        b : (G, n, 3) float32, radiance, scene-linear
+            Unedited light that the casters send, by group of lights.
+        receivers : Ends of n points, or of 1 that all pairs share
+        casters : Ends of n points
+        resolved : sequence of (n, 3) or (1, 3) float32
+            Scale of each resolved aggregate at the pairs' receivers, in the order of `aggregates`.
+        upto : int, optional
+            Compose only the edits before this one.
 
         Returns
         -------
         StackCoefficients
         """
-        n = len(incident)
-        scale = np.ones((n, 3), np.float32)
-        emission = np.zeros((n, 3), np.float32)
-        offsets: list[F32 | None] = [None, None]
-        row = 0
-        for bound in self.edits:
-            n_keys = len(bound.receivers)
-            weights = [
-                np.float32(bound.edit.amount * key_weight) * receiver[row + k] * caster[row + k]
-                for k, key_weight in enumerate(bound.key_weights)
-            ]
-            row += n_keys
+        n_groups, n = b.shape[:2]
+        state = _State(
+            scale=np.ones((n_groups, n, 3), np.float32),
+            emission=np.zeros((n, 3), np.float32),
+            offsets=[None, None, *(None for _ in self.throughs)],
+        )
+        throughs = {edit: 2 + slot for slot, edit in enumerate(self.throughs)}
+        row = located = n_resolved = 0
+        for index, bound in enumerate(self.edits[:upto]):
+            rows = range(row, row + bound.n_keys)
+            row += bound.n_keys
+            first_located = located
+            located += sum(rows_of_key is not None for rows_of_key in bound.rows)
+            if bound.level is Level.VIEW:
+                continue
+            scales: Sequence[F32] = ()
+            if bound.level is Level.AGGREGATE:
+                scales = resolved[n_resolved : n_resolved + bound.n_keys]
+                n_resolved += bound.n_keys
+            weights = _pair_weights(bound, rows, receivers, casters, first_located)
             touched = np.flatnonzero(np.any([w != 0 for w in weights], axis=0))
             if len(touched) == 0:
                 continue
-            blend = bound.edit.blend
-            seen = incident[touched]
-            if blend is Blend.COMPOSE:
-                seen = scale[touched] * seen + emission[touched]
-            delta, added, offset = _interpolate_keys(bound, seen, [w[touched, None] for w in weights])
-            kept = np.sum([w[touched, None] for w in weights], axis=0)
-            if blend is Blend.COMPOSE:
-                factor, carried = 1 + delta, 1 + delta
-            elif blend is Blend.OVER:
-                factor, carried = 1 - kept, 1 - kept
-            else:
-                factor = carried = np.ones_like(delta)
-            scale[touched] = (
-                factor * scale[touched] + {Blend.COMPOSE: 0, Blend.OVER: kept + delta, Blend.ADD: delta}[blend]
+            self._apply(
+                state, bound, b, receivers, casters, weights, touched, scales, first_located, throughs.get(index)
             )
-            emission[touched] = carried * emission[touched] + added
-            paints = bound.operation is not None and not bound.operation.offset_times_albedo
-            for slot in range(2):
-                before = offsets[slot]
-                after = None if before is None else before.copy()
-                if after is not None:
-                    after[touched] *= carried
-                if offset is not None and slot == int(paints):
-                    after = np.zeros((n, 3), np.float32) if after is None else after
-                    after[touched] += offset
-                offsets[slot] = after
-        return StackCoefficients(scale, emission, offsets[0], offsets[1])
+        return StackCoefficients(
+            state.scale, state.emission, state.offsets[0], state.offsets[1], tuple(state.offsets[2:])
+        )
+
+    def _apply(
+        self,
+        state: _State,
+        bound: BoundEdit,
+        b: F32,
+        receivers: Ends,
+        casters: Ends,
+        weights: list[F32],
+        touched: I64,
+        resolved: Sequence[F32],
+        first_located: int,
+        through_slot: int | None,
+    ) -> None:
+        """Lay one edit over the state, at the touched pairs."""
+        n = b.shape[1]
+        which: Any = slice(None) if len(touched) == n else touched
+        groups = np.flatnonzero(bound.groups)
+        seen = _seen(state, bound, b, groups, which)
+        pairs = Pairs(seen, _end(receivers.place, which, n), _end(casters.place, which, n))
+        delta, added = np.zeros_like(seen), np.zeros_like(seen)
+        extra: dict[int, F32] = {}
+        kept = np.zeros((len(seen), 1), np.float32)
+        located = first_located
+        for key in range(bound.n_keys):
+            weight = weights[key][which, None]
+            if bound.level is Level.AGGREGATE:
+                scale = resolved[key]
+                coefficients = PairCoefficients(scale if len(scale) == 1 else scale[which])
+            else:
+                at = (None, None)
+                if bound.rows[key] is not None:
+                    at = (_pick(receivers.located[located], which, n), _pick(casters.located[located], which, n))
+                    located += 1
+                coefficients = bound.evaluate(key, pairs, *at)
+            kept += weight
+            delta += weight * (coefficients.scale - ONE)
+            if coefficients.emission is not None:
+                added += weight * coefficients.emission
+            for slot, value in (
+                (int(bound.offset_is_paint), coefficients.offset),
+                (through_slot, coefficients.through),
+            ):
+                if value is not None and slot is not None:
+                    extra[slot] = weight * value + extra.get(slot, np.float32(0))
+        all_groups = len(groups) == len(b)
+        carried = {Blend.COMPOSE: ONE + delta, Blend.OVER: ONE - kept, Blend.ADD: np.ones_like(kept)}[bound.edit.blend]
+        for group in groups:
+            before = state.scale[group, which]
+            if bound.edit.blend is Blend.COMPOSE:
+                state.scale[group, which] = carried * before
+            else:
+                state.scale[group, which] = carried * before + (kept * (bound.edit.blend is Blend.OVER) + delta)
+        if all_groups:
+            state.emission[which] = carried * state.emission[which] + added
+        else:
+            state.emission[which] += added
+        for slot, value in enumerate(state.offsets):
+            if value is not None:
+                for group in groups:
+                    value[group, which] *= carried
+            if slot in extra:
+                if value is None:
+                    value = state.offsets[slot] = np.zeros((len(b), n, 3), np.float32)
+                for group in groups:
+                    value[group, which] += extra[slot]
+
+    # Receivers
+
+    def resolve(self, aggregate: Aggregate, light: F32) -> tuple[F32, F32]:
+        """What an aggregate makes of the light of its casters.
+
+        Parameters
+        ----------
+        light : (n, 3) float32, radiance
+            All that n receivers get from the casters, weighted by the casters' masks, as the weaker edits leave it.
+
+        Returns
+        -------
+        scale, added : (n, 3) float32
+            The light becomes ``scale light + added``; `added` is what no bounded scale can reach.
+        """
+        bound = self.edits[aggregate.edit]
+        assert bound.operation is not None
+        light = np.maximum(light, np.float32(0))
+        wanted = bound.operation.evaluate_aggregate(bound.parameters[aggregate.key], light)
+        coefficients = divide(light, wanted)
+        assert coefficients.emission is not None
+        return coefficients.scale, coefficients.emission
+
+    def aggregate_share(self, aggregate: Aggregate, casters: Ends) -> F32:
+        """How much of the light of each group and caster the aggregate looks at, (G, n, 1).
+
+        Emission and whatever else has no group belongs to it only where it acts on all groups.
+        """
+        bound = self.edits[aggregate.edit]
+        mask = casters.masks[aggregate.row]
+        return (bound.groups[:, None].astype(np.float32) * mask[None, :])[:, :, None]
+
+    def aggregate_weight(self, aggregate: Aggregate, receivers: Ends) -> F32:
+        """Factor on `added` of `resolve` at the receivers, (n, 1)."""
+        bound = self.edits[aggregate.edit]
+        share = np.float32(bound.edit.amount * bound.key_weights[aggregate.key])
+        return (share * receivers.masks[aggregate.row])[:, None]
+
+    def finish(self, light: F32, receivers: Ends) -> F32:
+        """Apply what acts on views to (n, 3) edited indirect light, then clamp it at zero."""
+        row = 0
+        scale: F32 | None = None
+        offset: F32 = np.zeros_like(light)
+        for bound in self.edits:
+            rows = range(row, row + bound.n_keys)
+            row += bound.n_keys
+            if bound.level is not Level.VIEW:
+                continue
+            scale = np.ones_like(light) if scale is None else scale
+            delta, added = np.zeros_like(light), np.zeros_like(light)
+            kept = np.zeros((len(light), 1), np.float32)
+            for key, mask_row in enumerate(rows):
+                weight = (np.float32(bound.edit.amount * bound.key_weights[key]) * receivers.masks[mask_row])[:, None]
+                s, o = bound.view(key)
+                kept, delta, added = kept + weight, delta + weight * (s - ONE), added + weight * o
+            carried = {Blend.COMPOSE: ONE + delta, Blend.OVER: ONE - kept, Blend.ADD: ONE}[bound.edit.blend]
+            scale = carried * scale
+            if bound.edit.blend is not Blend.COMPOSE:
+                scale = scale + (kept * (bound.edit.blend is Blend.OVER) + delta)
+            offset = carried * offset + added
+        # Once, at the end: a weaker edit's negative light may be lifted by a stronger one.
+        return np.maximum(light if scale is None else scale * light + offset, np.float32(0))
 
 
-def _interpolate_keys(bound: BoundEdit, seen: F32, weights: list[F32]) -> tuple[F32, F32, F32 | None]:
-    """Sum over keys of weight x (scale - 1, emission, offset)."""
-    delta = np.zeros_like(seen)
-    added = np.zeros_like(seen)
-    offset: F32 | None = None
-    for key, weight in enumerate(weights):
-        coefficients = bound.evaluate(key, seen)
-        delta += weight * (coefficients.scale - np.float32(1))
-        if coefficients.emission is not None:
-            added += weight * coefficients.emission
-        if coefficients.offset is not None:
-            offset = weight * coefficients.offset + (0 if offset is None else offset)
-    return delta, added, offset
+@dataclass(eq=False)
+class _State:
+    """What the edits so far have made of the pairs."""
+
+    scale: F32
+    emission: F32
+    offsets: list[F32 | None]  #: diffuse, paint, then one for each edit that lets light through
+
+
+def _ends(masks: list[F32], located: list[Any], points: SurfacePoints, with_place: bool) -> Ends:
+    n = len(points.instance)
+    place = PairEnd(points.position, points.shading_normal, points.albedo) if with_place else None
+    return Ends(np.stack(masks) if masks else np.zeros((0, n), np.float32), place, tuple(located))
+
+
+def _end(place: PairEnd | None, which: Any, n: int) -> PairEnd:
+    if place is None:
+        return _NOWHERE
+    return place if len(place.position) != n else PairEnd(*(column[which] for column in place))
+
+
+def _pick(entry: Any, which: Any, n: int) -> Any:
+    if isinstance(which, slice):
+        return entry
+    shared = len(entry[0] if isinstance(entry, tuple) else entry) != n
+    return entry if shared else _taken(entry, which)
+
+
+def _pair_weights(bound: BoundEdit, rows: range, receivers: Ends, casters: Ends, first_located: int) -> list[F32]:
+    """Amount x key weight x u x w of each key, (n,) each."""
+    shares: list[Any] = [np.float32(bound.edit.amount * weight) for weight in bound.key_weights]
+    if bound.n_keys > 1 and all(key_rows is not None for key_rows in bound.rows):
+        # Where one key has no samples, the other speaks alone: disocclusion is no reason to fade.
+        confidence = [receivers.located[first_located + k].confidence for k in range(bound.n_keys)]
+        total = sum(w * c for w, c in zip(bound.key_weights, confidence, strict=True))
+        safe = np.where(total > 0, total, ONE)
+        shares = [share * (c / safe).astype(np.float32) for share, c in zip(shares, confidence, strict=True)]
+    return [share * receivers.masks[row] * casters.masks[row] for share, row in zip(shares, rows, strict=True)]
+
+
+def _seen(state: _State, bound: BoundEdit, b: F32, groups: I64, which: Any) -> F32:
+    """The light that an edit looks at: as the weaker edits left it where it composes, else unedited."""
+    if bound.edit.blend is not Blend.COMPOSE:
+        return np.asarray(b[groups][:, which].sum(axis=0), np.float32)
+    seen = sum(state.scale[group, which] * b[group, which] for group in groups)
+    if len(groups) == len(b):
+        seen = seen + state.emission[which]
+    return np.asarray(seen, np.float32)
+
+
+def _bakes_offset(bound: BoundEdit) -> bool:
+    constants = any(baked is not None and baked.offset is not None for baked in bound.baked)
+    return constants or any(rows is not None and rows.has_offset for rows in bound.rows)
+
+
+# Binding --------------------------------------------------------------------------------------------------------------
 
 
 def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
@@ -197,69 +457,144 @@ def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
     ------
     EditError
         An operation is unknown and no payload holds it baked, a parameter is
-        wrong, or a painted mask was made for another mesh.
+        wrong, a light or an occluder does not exist, or a painted mask cannot
+        be placed on the scene.
     """
-    bound = (_bind_edit(edit, snapshot) for edit in stack.active)
+    group, members = _light_groups(stack, snapshot)
+    bound = [_bind_edit(edit, snapshot, members.get(edit.path)) for edit in stack.active]
+    n_groups = int(group.max(initial=0)) + 1
     # An edit that is blocked at this time has no key left: the identity.
-    return EditField(tuple(edit for edit in bound if edit.key_weights))
+    edits = tuple(edit for edit in bound if edit.n_keys)
+    edits = tuple(_with_groups(edit, n_groups) for edit in edits)
+    return EditField(edits, group, n_groups, _findings(edits))
 
 
-def _bind_edit(edit: Edit, snapshot: SceneSnapshot) -> BoundEdit:
+def _light_groups(stack: EditStack, snapshot: SceneSnapshot) -> tuple[I64, dict[str, Bool]]:
+    """Lights that no edit tells apart form a group; which groups each edit with lights of its own acts on."""
+    named = {edit.path: _named_lights(edit, snapshot) for edit in stack.active if edit.lights}
+    if not named:
+        return np.zeros(len(snapshot.light_paths), np.int64), {}
+    table = np.stack(list(named.values()), axis=1)
+    signatures, group = np.unique(table, axis=0, return_inverse=True)
+    return group.reshape(-1).astype(np.int64), {path: signatures[:, i] for i, path in enumerate(named)}
+
+
+def _named_lights(edit: Edit, snapshot: SceneSnapshot) -> Bool:
+    wanted = edit.lights
+    below = tuple(path + "/" for path in wanted)
+    found = np.array([path in wanted or path.startswith(below) for path in snapshot.light_paths], np.bool_)
+    if not found.any():
+        known = ", ".join(snapshot.light_paths[:8]) or "none"
+        raise EditError(f"{edit.path}: {', '.join(wanted)} is no light of this scene; its lights: {known}")
+    return found
+
+
+def _with_groups(bound: BoundEdit, n_groups: int) -> BoundEdit:
+    if len(bound.groups):
+        return bound
+    return BoundEdit(**{**bound.__dict__, "groups": np.ones(n_groups, np.bool_)})
+
+
+def _findings(edits: tuple[BoundEdit, ...]) -> tuple[Finding, ...]:
+    sources = [source for bound in edits for source in (*bound.receivers, *bound.casters, *bound.rows) if source]
+    return tuple(dict.fromkeys(finding for source in sources for finding in getattr(source, "findings", ())))
+
+
+def _bind_edit(edit: Edit, snapshot: SceneSnapshot, groups: Bool | None) -> BoundEdit:
     operation = operations.find(edit.operation)
-    keys = [(key.payload, key.weight) for key in edit.keys if key.payload is not None]
-    if operation is None and (not keys or any(payload.scale_delta is None for payload, _ in keys)):
-        raise EditError(
-            f"{edit.path}: operation '{edit.operation}' is unknown and no payload holds it baked;"
-            f" known are {', '.join(operations.names())}; install the package that brings it, or mute the edit"
+    payloads: list[tuple[Payload | None, float]] = [(None, 1.0)]
+    if edit.keys:
+        payloads = [(key.payload, key.weight) for key in edit.keys if key.payload is not None]
+    rows, baked = [], []
+    for payload, _ in payloads:
+        use_rows = operation is None and payload is not None and payload.rows is not None
+        rows.append(_bind_rows(payload, snapshot, edit.path) if use_rows and payload is not None else None)
+        baked.append(_constants(payload) if operation is None and rows[-1] is None else None)
+        if operation is None and rows[-1] is None and baked[-1] is None:
+            raise EditError(
+                f"{edit.path}: operation '{edit.operation}' is unknown and no payload holds it baked;"
+                f" known are {', '.join(operations.names())}; install the package that brings it, or mute the edit"
+            )
+    # Rows have all soft weights multiplied in; what the collections say still holds.
+    masks = [(None, None) if r is not None else _masks(p) for r, (p, _) in zip(rows, payloads, strict=True)]
+    sides = [
+        tuple(
+            bind_selection(
+                Selection(selection.paths) if key_rows is not None else selection, pair[side], snapshot, edit.path
+            )
+            for key_rows, pair in zip(rows, masks, strict=True)
         )
-    if not edit.keys:
-        plain = {} if operation is None else operation.complete(edit.parameters, edit.path)
-        receivers = _bound_mask(edit, edit.receivers, None, snapshot)
-        casters = _bound_mask(edit, edit.casters, None, snapshot)
-        return BoundEdit(edit, operation, (plain,), (), (receivers,), (casters,), (1.0,))
+        for side, selection in enumerate((edit.receivers, edit.casters))
+    ]
     return BoundEdit(
         edit,
         operation,
-        parameters=tuple({} if operation is None else operation.complete(p.parameters, edit.path) for p, _ in keys),
-        baked=tuple(np.asarray(p.scale_delta or (0.0, 0.0, 0.0), np.float32) for p, _ in keys),
-        receivers=tuple(_bound_mask(edit, edit.receivers, p.receiver_mask, snapshot) for p, _ in keys),
-        casters=tuple(_bound_mask(edit, edit.casters, p.caster_mask, snapshot) for p, _ in keys),
-        key_weights=tuple(weight for _, weight in keys),
+        parameters=tuple(
+            _prepared(operation, edit, payload, snapshot, receivers, casters)
+            for (payload, _), receivers, casters in zip(payloads, *sides, strict=True)
+        ),
+        baked=tuple(baked),
+        rows=tuple(rows),
+        receivers=sides[0],
+        casters=sides[1],
+        key_weights=tuple(weight for _, weight in payloads),
+        groups=np.zeros(0, np.bool_) if groups is None else groups,
+        occluders=_occluders(operation, edit, snapshot),
     )
 
 
-_NO_FACES = np.zeros(0, np.int64)
+def _masks(payload: Payload | None) -> tuple[Any, Any]:
+    return (None, None) if payload is None else (payload.receiver_mask, payload.caster_mask)
 
 
-def _member(selection: Selection, snapshot: SceneSnapshot) -> F32:
-    included = np.array([surface.path in selection.paths for surface in snapshot.surfaces], np.float32)
-    return included[snapshot.geometry.instance_surface] if len(included) else np.zeros(0, np.float32)
+def _bind_rows(payload: Payload, snapshot: SceneSnapshot, where: str) -> Any:
+    from icheat_usd.edits.encodings.rows import bind_rows
+
+    assert payload.rows is not None
+    return bind_rows(payload.rows, snapshot, where)
 
 
-def _bound_mask(edit: Edit, selection: Selection, mask: SurfaceMask | None, snapshot: SceneSnapshot) -> BoundMask:
-    member = _member(selection, snapshot)
-    if mask is None:
-        return BoundMask(member, None, _NO_FACES)
-    begins = np.concatenate([[0], np.cumsum([surface.n_faces for surface in mask.surfaces])])
-    rows = {(s.path, s.instance_id, s.part): (s, int(begins[i])) for i, s in enumerate(mask.surfaces)}
-    first = np.full(len(snapshot.surfaces), -1, np.int64)
-    found = 0
-    for i, surface in enumerate(snapshot.surfaces):
-        entry = rows.get((surface.path, surface.instance_id, surface.part))
-        if entry is None:
-            continue
-        masked, begin = entry
-        if masked.topology_digest and masked.topology_digest != surface.topology_digest:
-            raise EditError(
-                f"{edit.path}: its painted mask was made for another topology of {surface.path}"
-                f" ({masked.n_faces} faces then, {surface.n_faces} now); paint it again or mute the edit"
-            )
-        first[i] = begin
-        found += 1
-    if not found:
+def _constants(payload: Payload | None) -> PairCoefficients | None:
+    if payload is None or (payload.scale_delta, payload.emission, payload.offset) == (None, None, None):
+        return None
+
+    def rgb(value: tuple[float, float, float] | None) -> F32 | None:
+        return None if value is None else np.asarray(value, np.float32)[None, :]
+
+    delta = rgb(payload.scale_delta or (0.0, 0.0, 0.0))
+    assert delta is not None
+    return PairCoefficients(ONE + delta, rgb(payload.emission), rgb(payload.offset))
+
+
+def _prepared(
+    operation: Operation | None,
+    edit: Edit,
+    payload: Payload | None,
+    snapshot: SceneSnapshot,
+    receivers: BoundSelection,
+    casters: BoundSelection,
+) -> Mapping[str, Value]:
+    from icheat_usd.edits.measures import Measures
+
+    if operation is None:
+        return {}
+    given = dict(edit.parameters if payload is None else payload.parameters)
+    parameters = operation.complete(given, edit.path)
+    for parameter in operation.parameters:
+        value = parameters[parameter.name]
+        if parameter.measure is Measure.POINT and isinstance(value, tuple):
+            parameters[parameter.name] = tuple(float(x - c) for x, c in zip(value, snapshot.centre, strict=True))
+    return operation.prepare(parameters, Measures(snapshot, receivers, casters))
+
+
+def _occluders(operation: Operation | None, edit: Edit, snapshot: SceneSnapshot) -> Bool:
+    """Instances that the edit lets light through."""
+    below = tuple(path.rstrip("/") + "/" for path in edit.occluders)
+    named = [s.path in edit.occluders or s.path.startswith(below) for s in snapshot.surfaces]
+    surfaces = np.array(named, np.bool_)
+    if operation is not None and operation.has_through and not surfaces.any():
         raise EditError(
-            f"{edit.path}: its payload was made for another scene: none of its {len(mask.surfaces)} painted surfaces"
-            f" (such as {mask.surfaces[0].path if mask.surfaces else '-'}) is in this one;"
-            " point icheat:filePath at the right sidecar, or set rel icheat:anchor"
+            f"{edit.path}: operation '{operation.name}' has no occluders in this scene; name the prims that light"
+            " should pass through with rel icheat:occluders, or mute the edit"
         )
-    return BoundMask(member, mask, first[snapshot.geometry.instance_surface])
+    return surfaces[snapshot.geometry.instance_surface] if len(surfaces) else np.zeros(0, np.bool_)

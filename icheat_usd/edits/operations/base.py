@@ -124,6 +124,8 @@ class Operation(ABC):
     uses_incident: ClassVar[bool] = False
     #: True if they depend on `Pairs.receiver`, so that view samples cannot share them.
     uses_receiver: ClassVar[bool] = False
+    #: True if they depend on `Pairs.caster`.
+    uses_caster: ClassVar[bool] = False
     #: True if `evaluate` gives offsets.
     has_offset: ClassVar[bool] = False
     #: True if the offset is light that the receiver's diffuse albedo reflects, False if it is paint on top.
