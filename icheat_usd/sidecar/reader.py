@@ -24,7 +24,8 @@ import numpy as np
 from icheat_usd.edits.model import Payload
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar.canonical import Array, Element, digest_of, kind_of
-from icheat_usd.sidecar.elements import check_known, decode_payload
+from icheat_usd.sidecar.elements import decode_payload
+from icheat_usd.sidecar.registry import check_known
 
 FORMAT = "icheat-sidecar"
 FORMAT_VERSION = 1

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as npst
 from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar import Element, pack, payload_digest, read_payload, write_payloads
-from icheat_usd.sidecar import elements as registry
+from icheat_usd.sidecar import elements, registry
 from icheat_usd.sidecar.canonical import digest_of
 
 _text = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=12)
@@ -131,7 +131,7 @@ def test_masks_follow_the_anchor_they_are_read_with(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("steps", "dtype"), [(255, "u1"), (65535, "u2"), (1000, "f4")])
 def test_texels_are_stored_in_the_smallest_type_that_is_exact(steps: int, dtype: str) -> None:
     texels = (np.arange(200, dtype=np.float32) / np.float32(steps)).reshape(-1, 1, 1)
-    encoded = registry.encode_payload(Payload("scale", {}, receiver_mask=_mask(texels)), anchor="/World")
+    encoded = elements.encode_payload(Payload("scale", {}, receiver_mask=_mask(texels)), anchor="/World")
     assert encoded["receiver-mask"].datasets["texels"].dtype == np.dtype(dtype)
 
 
@@ -166,7 +166,7 @@ def test_minus_zero_is_zero_in_names_and_in_files() -> None:
     payloads = [
         Payload("scale", {"amount": zero}, _mask([[[zero]], [[0.001]]]), None, (zero, 1.0, 2.0)) for zero in (0.0, -0.0)
     ]
-    plus, minus = (registry.encode_payload(payload, anchor="/World") for payload in payloads)
+    plus, minus = (elements.encode_payload(payload, anchor="/World") for payload in payloads)
     for element in minus.values():
         for path, values in element.datasets.items():
             assert values.dtype.kind != "f" or not np.signbit(values).any(), path
