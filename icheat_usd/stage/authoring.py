@@ -12,27 +12,27 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pxr import Ar, Sdf, Tf, Usd
+from pxr import Sdf, Usd
 
 from icheat_usd.edits import operations
 from icheat_usd.edits.model import Blend, Value
-from icheat_usd.errors import EditError, StageError
+from icheat_usd.errors import EditError
 from icheat_usd.stage import collections, schema
-from icheat_usd.stage.edit_stack import EditFinding, edit_prim, stack_prim
-from icheat_usd.stage.keys import SAME_TIME, Key, KeyTrack, read_keys, strongest_opinion
-
-#: customData of icheat:payload in a layer that copied another layer's keys: where they came from.
-COPIED_FROM = "icheatCopiedFrom"
-
-#: Layers whose file is larger than this are not compared with it before the first edit.
-_MAX_COMPARED_BYTES = 8 << 20
-_seen_on_disk: dict[str, str] = {}
+from icheat_usd.stage.key_authoring import set_payload_key as set_payload_key
+from icheat_usd.stage.key_authoring import write_key
+from icheat_usd.stage.keys import strongest_opinion
+from icheat_usd.stage.layers import asset_path, overridden_opinions, refuse_instances, writable_edit
+from icheat_usd.stage.layers import find_layer as find_layer
+from icheat_usd.stage.layers import reload_layer as reload_layer
+from icheat_usd.stage.layers import remember_layer as remember_layer
+from icheat_usd.stage.layers import save_layer as save_layer
+from icheat_usd.stage.layers import writing as writing
+from icheat_usd.stage.stacks import EditFinding, stack_prim
 
 
 @dataclass(frozen=True)
@@ -41,140 +41,6 @@ class Members:
 
     includes: tuple[str, ...] = ()
     excludes: tuple[str, ...] = ()
-
-
-# --------------------------------------------------------------------------- layers
-
-
-def find_layer(stage: Usd.Stage, layer: str | Sdf.Layer) -> Sdf.Layer:
-    """The layer to write to, checked to be one that this stage can write to.
-
-    Raises
-    ------
-    EditError
-        It is not in the stage's own layer stack, several match, it may not be edited, or its file changed on disk
-        since it was read.
-    """
-    layers = stage.GetLayerStack(includeSessionLayers=True)
-    if isinstance(layer, Sdf.Layer):
-        matches = [candidate for candidate in layers if candidate == layer]
-    elif layer == "session":
-        matches = [stage.GetSessionLayer()] if stage.GetSessionLayer() else []
-    else:
-        exact = {layer, os.path.realpath(layer)}
-        matches = [candidate for candidate in layers if {candidate.identifier, candidate.realPath} & exact]
-        matches = matches or [candidate for candidate in layers if _file_name(candidate) == layer]
-    name = layer.identifier if isinstance(layer, Sdf.Layer) else layer
-    if len(matches) != 1:
-        known = ", ".join(candidate.identifier for candidate in layers)
-        count = "is not" if not matches else f"matches {len(matches)} layers"
-        raise EditError(
-            f"layer '{name}' {count} in the layer stack of {stage.GetRootLayer().identifier}, which has {known}; "
-            f"name one of them or 'session'"
-        )
-    if not matches[0].permissionToEdit:
-        raise EditError(f"layer '{matches[0].identifier}' may not be edited; name another layer")
-    remember_layer(matches[0])
-    return matches[0]
-
-
-def _file_name(layer: Sdf.Layer) -> str:
-    return os.path.basename(layer.realPath or layer.identifier)
-
-
-def remember_layer(layer: Sdf.Layer) -> None:
-    """Note what a layer's file looks like now, so that `save_layer` can tell whether someone else wrote it.
-
-    Call it when a stage has just been opened; the functions here call it before they first write to a layer.
-
-    Raises
-    ------
-    EditError
-        The layer has no unsaved changes, and its file says something else than it does.
-    """
-    on_disk = _on_disk(layer)
-    if not on_disk or (layer.dirty and layer.identifier in _seen_on_disk):
-        return
-    if not layer.dirty and _seen_on_disk.get(layer.identifier) != on_disk and not _says_what_its_file_says(layer):
-        raise _changed(layer)
-    _seen_on_disk[layer.identifier] = on_disk
-
-
-def _on_disk(layer: Sdf.Layer) -> str:
-    try:
-        state = os.stat(layer.realPath)
-    except OSError:
-        return ""
-    return f"{state.st_ino}:{state.st_size}:{state.st_mtime_ns}"
-
-
-def _says_what_its_file_says(layer: Sdf.Layer) -> bool:
-    if os.path.getsize(layer.realPath) > _MAX_COMPARED_BYTES:
-        return True
-    fresh = Sdf.Layer.OpenAsAnonymous(layer.realPath)
-    return bool(fresh) and fresh.ExportToString() == layer.ExportToString()
-
-
-def _changed(layer: Sdf.Layer) -> EditError:
-    return EditError(
-        f"{layer.realPath} changed on disk since it was read, so saving would lose that change; reload it first"
-    )
-
-
-def save_layer(layer: Sdf.Layer) -> None:
-    """Save a layer, unless someone else wrote its file since it was read.
-
-    Raises
-    ------
-    EditError
-        The layer has no file, its file changed on disk, or may not be written.
-    """
-    if layer.anonymous:
-        raise EditError(f"layer '{layer.identifier}' has no file; export it or author in a layer that has one")
-    known = _seen_on_disk.get(layer.identifier)
-    if known is not None and _on_disk(layer) not in ("", known):
-        raise _changed(layer)
-    try:
-        saved = layer.Save()
-    except Tf.ErrorException as error:
-        raise EditError(f"{layer.realPath} cannot be saved ({_first_line(error)}); check its permissions") from error
-    if not saved:
-        raise EditError(f"{layer.realPath} cannot be saved; check its permissions")
-    _seen_on_disk[layer.identifier] = _on_disk(layer)
-
-
-def _first_line(error: Tf.ErrorException) -> str:
-    line = next((line.strip() for line in str(error).splitlines() if line.strip()), "unknown reason")
-    return line.partition(" : ")[2].strip("'") or line
-
-
-@contextmanager
-def writing(stage: Usd.Stage, layer: str | Sdf.Layer, path: str | Sdf.Path) -> Iterator[Sdf.Layer]:
-    """Write opinions at or below `path` to a layer, times mapped into it.
-
-    USD's refusals become errors; after any error the layer says what it said before.
-    """
-    schema.require_registered()
-    target = find_layer(stage, layer)
-    path = Sdf.Path(path)
-    before = Sdf.Layer.CreateAnonymous()
-    existed = bool(target.GetPrimAtPath(path))
-    if existed:
-        Sdf.CreatePrimInLayer(before, path)
-        Sdf.CopySpec(target, path, before, path)
-    first_new = next((prefix for prefix in path.GetPrefixes() if not target.GetPrimAtPath(prefix)), path)
-    try:
-        with Usd.EditContext(stage, stage.GetEditTargetForLocalLayer(target)):
-            yield target
-    except BaseException as error:
-        if existed:
-            Sdf.CopySpec(before, path, target, path)
-        elif target.GetPrimAtPath(first_new):
-            siblings = target.GetPrimAtPath(first_new.GetParentPath()).nameChildren
-            del siblings[first_new.name]
-        if isinstance(error, Tf.ErrorException):
-            raise EditError(f"{target.identifier}: USD refused the edit ({_first_line(error)})") from error
-        raise
 
 
 # --------------------------------------------------------------------------- stacks
@@ -217,7 +83,7 @@ def create_stack(stage: Usd.Stage, path: str, *, layer: str | Sdf.Layer, camera:
             f"a stack at {path} is lost when {stage.GetRootLayer().identifier} is referenced; place it below the "
             f"default prim, such as {default.GetPath()}/indirect"
         )
-    _refuse_instances(stage, stack_path)
+    refuse_instances(stage, stack_path)
     existing = stage.GetPrimAtPath(stack_path)
     if schema.has_schema(existing, schema.STACK_API):
         raise EditError(f"{stack_path} is a stack already; add edits to it or choose another path")
@@ -285,7 +151,7 @@ def add_edit(
     path = prim.GetPath().AppendChild(name)
     if stage.GetPrimAtPath(path):
         raise EditError(f"{path} exists already; choose another name or set its values")
-    _refuse_instances(stage, path)
+    refuse_instances(stage, path)
     with writing(stage, layer, prim.GetPath()) as target:
         edit = stage.DefinePrim(path, "Scope")
         _apply(edit, schema.EDIT_API)
@@ -309,7 +175,7 @@ def add_edit(
         if anchors:
             _relationship(edit, schema.ANCHOR).SetTargets([*anchors])
         if payload is not None:
-            _write_key(edit, target, time, _asset_path(target, os.fspath(payload[0])), payload[1])
+            write_key(edit, target, time, asset_path(target, os.fspath(payload[0])), payload[1])
         _append(_relationship(prim, schema.EDITS), path)
         if before is not None or after is not None:
             _move(prim, path, target, before=before, after=after)
@@ -446,7 +312,7 @@ def set_edit(
     EditError
         Something named does not exist or does not fit; the layer is then as before.
     """
-    prim = _writable_edit(stage, edit)
+    prim = writable_edit(stage, edit)
     written: list[str] = []
     selections: list[EditFinding] = []
     with writing(stage, layer, prim.GetPath()) as target:
@@ -469,38 +335,12 @@ def set_edit(
             if members is not None and not _set_members(prim, collection, members):
                 message = f"authored in {target.identifier}, but a stronger layer changes the selection"
                 selections.append(EditFinding(str(prim.GetPath()), collection, message))
-    return (*_overridden(prim, target, written, time), *selections)
+    return (*overridden_opinions(prim, target, written, time), *selections)
 
 
 def mute_edit(stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, muted: bool = True) -> tuple[EditFinding, ...]:
     """Mute or unmute an edit; see `set_edit`."""
     return set_edit(stage, edit, layer=layer, enabled=not muted)
-
-
-def _overridden(prim: Usd.Prim, layer: Sdf.Layer, names: Iterable[str], time: float | None) -> tuple[EditFinding, ...]:
-    findings = []
-    for name in names:
-        opinion = strongest_opinion(prim.GetAttribute(name), time)
-        if opinion is not None and opinion.layer != layer:
-            message = f"authored in {layer.identifier}, but {opinion.layer.identifier} is stronger and decides"
-            findings.append(EditFinding(str(prim.GetPath()), name, message))
-        elif opinion is not None and opinion.source != "default" and time is None:
-            message = f"authored without a time in {layer.identifier}, where time samples or a spline decide"
-            findings.append(EditFinding(str(prim.GetPath()), name, message))
-    return tuple(findings)
-
-
-def _writable_edit(stage: Usd.Stage, edit: str) -> Usd.Prim:
-    prim = edit_prim(stage, edit)
-    _refuse_instances(stage, prim.GetPath())
-    return prim
-
-
-def _refuse_instances(stage: Usd.Stage, path: Sdf.Path) -> None:
-    for ancestor in path.GetPrefixes():
-        prim = stage.GetPrimAtPath(ancestor)
-        if prim and (prim.IsInstance() or prim.IsInstanceProxy() or prim.IsInPrototype()):
-            raise EditError(f"{path} lies in the instance {ancestor}, whose contents are shared; place it outside")
 
 
 def _apply(prim: Usd.Prim, name: str) -> None:
@@ -622,152 +462,3 @@ def _author_difference(relationship: Usd.Relationship, wanted: tuple[Sdf.Path, .
         if path not in composed:
             _append(relationship, path)
     return set(relationship.GetTargets()) == set(wanted)
-
-
-# --------------------------------------------------------------------------- keys
-
-
-def set_payload_key(
-    stage: Usd.Stage,
-    edit: str,
-    *,
-    layer: str | Sdf.Layer,
-    time: float | None,
-    payload: tuple[str | Path, str] | None,
-    interpolation: str | None = None,
-) -> tuple[EditFinding, ...]:
-    """Author the payload of one keyframe.
-
-    USD does not merge time samples of two layers. If another layer decides the
-    keys, all of them are therefore copied to `layer` first, and the layer
-    notes where they came from; `check` reports when the source has moved on. A
-    payload that held for all times is not a key, and the first key hides it.
-
-    Parameters
-    ----------
-    time
-        Stage time of the key; None authors one payload for all times, in place of all keys.
-    payload
-        (file, digest), or None for the identity.
-    interpolation
-        ``"linear"`` or ``"held"``; None leaves it.
-
-    Raises
-    ------
-    EditError
-        There is no such edit, or its composed keys cannot be copied.
-    """
-    if interpolation not in (None, "linear", "held"):
-        raise EditError(f"{edit}: no key interpolation is called '{interpolation}'; there are linear, held")
-    prim = _writable_edit(stage, edit)
-    with writing(stage, layer, prim.GetPath()) as target:
-        if time is None:
-            _clear_keys(prim, target)
-        else:
-            _own_keys(prim, target)
-        asset = _asset_path(target, os.fspath(payload[0])) if payload is not None else None
-        _write_key(prim, target, time, asset, payload[1] if payload is not None else "")
-        if interpolation is not None:
-            _set(prim, schema.KEY_INTERPOLATION, interpolation)
-    return _overridden(prim, target, (schema.PAYLOAD, schema.FILE_PATH), time)
-
-
-def _clear_keys(prim: Usd.Prim, layer: Sdf.Layer) -> None:
-    for name in (schema.PAYLOAD, schema.FILE_PATH):
-        spec = layer.GetAttributeAtPath(prim.GetPath().AppendProperty(name))
-        if spec:
-            for time in layer.ListTimeSamplesForPath(spec.path):
-                layer.EraseTimeSample(spec.path, time)
-            spec.ClearDefaultValue()
-            spec.SetInfo("customData", {k: v for k, v in spec.customData.items() if k != COPIED_FROM})
-
-
-def _own_keys(prim: Usd.Prim, layer: Sdf.Layer) -> None:
-    """Make `layer` the one that decides the keys, by copying all composed ones."""
-    track = read_keys(prim)
-    opinion = strongest_opinion(prim.GetAttribute(schema.PAYLOAD))
-    if track is None or opinion is None or opinion.layer == layer or not track.times:
-        return
-    for key in track.keys:
-        _write_key(prim, layer, key.time, _asset_path(layer, key.anchored) if key.digest else None, key.digest)
-    spec = layer.GetAttributeAtPath(prim.GetPath().AppendProperty(schema.PAYLOAD))
-    source = opinion.layer.realPath or opinion.layer.identifier
-    if spec:
-        spec.customData[COPIED_FROM] = {"layer": _asset_path(layer, source), "keys": track.digest}
-
-
-def copied_keys_are_current(prim: Usd.Prim) -> tuple[str, bool] | None:
-    """Whether keys that a layer copied still equal their source.
-
-    Returns
-    -------
-    (str, bool) or None
-        Identifier of the source layer and whether it still says the same; None where nothing was copied.
-    """
-    opinion = strongest_opinion(prim.GetAttribute(schema.PAYLOAD))
-    if opinion is None:
-        return None
-    note = opinion.layer.GetAttributeAtPath(opinion.path).customData.get(COPIED_FROM)
-    if not note:
-        return None
-    identifier = Sdf.ComputeAssetPathRelativeToLayer(opinion.layer, str(note.get("layer", "")))
-    for spec, offset in prim.GetAttribute(schema.PAYLOAD).GetPropertyStackWithLayerOffsets(schema.time_code(None)):
-        if (
-            identifier in (spec.layer.identifier, spec.layer.realPath)
-            and spec.layer.GetNumTimeSamplesForPath(spec.path) > 0
-        ):
-            samples = [
-                (t, spec.layer.QueryTimeSample(spec.path, t)) for t in spec.layer.ListTimeSamplesForPath(spec.path)
-            ]
-            keys = tuple(
-                Key(offset * t, "" if isinstance(value, Sdf.ValueBlock) else str(value)) for t, value in samples
-            )
-            held = schema.read_attribute(prim, schema.KEY_INTERPOLATION, None) == "held"
-            track = KeyTrack(keys, held, identifier)
-            return identifier, note.get("keys") == track.digest
-    return identifier, False
-
-
-def _write_key(prim: Usd.Prim, layer: Sdf.Layer, time: float | None, asset: str | None, digest: str) -> None:
-    for name, value in ((schema.FILE_PATH, asset and Sdf.AssetPath(asset)), (schema.PAYLOAD, digest)):
-        attribute = prim.GetAttribute(name)
-        if time is None:
-            attribute.Set(value if asset else Sdf.ValueBlock())
-            continue
-        stage_time = float(time)
-        _erase_sample(prim, layer, name, stage_time)
-        attribute.Set(value if asset else Sdf.ValueBlock(), Usd.TimeCode(stage_time))
-
-
-def _erase_sample(prim: Usd.Prim, layer: Sdf.Layer, name: str, stage_time: float) -> None:
-    """Drop a sample at the same stage time that rounding of the layer offset moved by a hair."""
-    path = prim.GetPath().AppendProperty(name)
-    target = prim.GetStage().GetEditTargetForLocalLayer(layer)
-    offset = target.GetMapFunction().timeOffset
-    for layer_time in layer.ListTimeSamplesForPath(path):
-        if abs(offset * layer_time - stage_time) <= SAME_TIME:
-            layer.EraseTimeSample(path, layer_time)
-
-
-def _asset_path(layer: Sdf.Layer, file: str) -> str:
-    """`file` as the layer should say it: relative to its own file where it has one."""
-    if "://" in file or file.startswith("anon:"):
-        return file
-    absolute = os.path.abspath(file)
-    if layer.anonymous or not layer.realPath or Ar.IsPackageRelativePath(file):
-        return absolute
-    relative = os.path.relpath(absolute, os.path.dirname(layer.realPath)).replace(os.sep, "/")
-    return relative if relative.startswith("../") else f"./{relative}"
-
-
-def reload_layer(layer: Sdf.Layer) -> None:
-    """Read a layer's file again, dropping unsaved changes.
-
-    Raises
-    ------
-    StageError
-        The file cannot be read.
-    """
-    if not layer.Reload(force=True):
-        raise StageError(f"{layer.identifier} cannot be read again; check that the file exists")
-    _seen_on_disk[layer.identifier] = _on_disk(layer)

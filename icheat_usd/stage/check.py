@@ -20,17 +20,11 @@ from pxr import Sdf, Usd
 from icheat_usd.edits.model import Blend
 from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.resources import resource_path
-from icheat_usd.stage import authoring, collections, schema
-from icheat_usd.stage.edit_stack import (
-    EditFinding,
-    PayloadReader,
-    Severity,
-    anchor_path,
-    listed_edits,
-    open_asset,
-)
+from icheat_usd.stage import collections, key_authoring, schema
+from icheat_usd.stage.edit_stack import PayloadReader, anchor_path, open_asset
 from icheat_usd.stage.keys import SAME_TIME, read_keys, strongest_opinion
 from icheat_usd.stage.opening import quiet_usd
+from icheat_usd.stage.stacks import EditFinding, Severity, listed_edits
 
 
 @dataclass(frozen=True)
@@ -281,7 +275,7 @@ class UnknownToken(Rule):
         for prim in context.edits:
             for name, allowed in (
                 (schema.BLEND, [blend.value for blend in Blend]),
-                (schema.KEY_INTERPOLATION, ["linear", "held"]),
+                (schema.KEY_INTERPOLATION, ["linear", "smooth", "held"]),
             ):
                 token = schema.read_attribute(prim, name, context.time)
                 if token not in allowed:
@@ -445,7 +439,7 @@ class CopiedKeysOutdated(Rule):
 
     def find(self, context: Context) -> Found:
         for prim in context.edits:
-            state = authoring.copied_keys_are_current(prim)
+            state = key_authoring.copied_keys_are_current(prim)
             if state is not None and not state[1]:
                 yield prim, schema.PAYLOAD, f"keys were copied from {state[0]}, which has changed; copy them again"
 

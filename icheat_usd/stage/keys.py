@@ -11,6 +11,7 @@ from __future__ import annotations
 import bisect
 import hashlib
 from dataclasses import dataclass
+from enum import StrEnum
 
 from pxr import Sdf, Usd
 
@@ -19,6 +20,14 @@ from icheat_usd.stage import schema
 
 #: Two times closer than this, in frames, are one: far above rounding of a mapped time, far below a shutter.
 SAME_TIME = 1e-6
+
+
+class Interpolation(StrEnum):
+    """What happens between two keys."""
+
+    LINEAR = "linear"  #: a straight line
+    SMOOTH = "smooth"  #: eased at both ends: no speed at a key
+    HELD = "held"  #: the earlier key holds
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,7 @@ class KeyTrack:
     """All keys of one edit, in order of time; at least one."""
 
     keys: tuple[Key, ...]
-    held: bool
+    interpolation: Interpolation
     layer: str  #: identifier of the layer whose opinion won
 
     @property
@@ -57,9 +66,11 @@ class KeyTrack:
 
     @property
     def digest(self) -> str:
-        """SHA-256 (hex) of times and payloads: changes when the track does."""
+        """SHA-256 (hex) of times, payloads and interpolation: changes when the track does."""
         text = repr([(None if key.time is None else round(key.time, 6), key.digest) for key in self.keys])
-        return hashlib.sha256(f"{text}{self.held}".encode()).hexdigest()
+        # Layers keep digests of keys that they copied, from when there was but a flag: held or not.
+        between = {Interpolation.LINEAR: "False", Interpolation.HELD: "True"}.get(self.interpolation, "smooth")
+        return hashlib.sha256(f"{text}{between}".encode()).hexdigest()
 
     def at(self, time: float | None) -> tuple[tuple[Key, float], ...]:
         """The one or two keys that hold at a stage time, with weights that sum to 1.
@@ -70,11 +81,13 @@ class KeyTrack:
         if time is None or not times or time <= times[0] + SAME_TIME:
             return ((self.keys[0], 1.0),)
         low = bisect.bisect_right(times, time + SAME_TIME) - 1
-        if low == len(times) - 1 or self.held or time <= times[low] + SAME_TIME:
+        if low == len(times) - 1 or self.interpolation is Interpolation.HELD or time <= times[low] + SAME_TIME:
             return ((self.keys[low], 1.0),)
         if self.keys[low].digest == self.keys[low + 1].digest:
             return ((self.keys[low], 1.0),)
         weight = (time - times[low]) / (times[low + 1] - times[low])
+        if self.interpolation is Interpolation.SMOOTH:
+            weight = weight * weight * (3.0 - 2.0 * weight)
         return ((self.keys[low], 1.0 - weight), (self.keys[low + 1], weight))
 
 
@@ -101,7 +114,8 @@ def read_keys(prim: Usd.Prim) -> KeyTrack | None:
     Raises
     ------
     EditError
-        The payload has no file, or file and payload are decided by different layers or at different times.
+        The payload has no file, file and payload are decided by different layers or at different times, or no
+        interpolation is called as it says.
     """
     payload = prim.GetAttribute(schema.PAYLOAD)
     opinion = strongest_opinion(payload)
@@ -109,10 +123,10 @@ def read_keys(prim: Usd.Prim) -> KeyTrack | None:
         raise EditError(f"{prim.GetPath()}: {schema.PAYLOAD} comes from value clips; author its keys in a layer")
     if opinion is None:
         return None
-    held = schema.read_attribute(prim, schema.KEY_INTERPOLATION, None) == "held"
+    interpolation = read_interpolation(prim)
     identifier = opinion.layer.identifier
     if opinion.is_blocked:
-        return KeyTrack((Key(None, ""),), held, identifier)
+        return KeyTrack((Key(None, ""),), interpolation, identifier)
     file_opinion = strongest_opinion(prim.GetAttribute(schema.FILE_PATH))
     if file_opinion is not None and file_opinion.layer != opinion.layer:
         raise EditError(
@@ -121,13 +135,29 @@ def read_keys(prim: Usd.Prim) -> KeyTrack | None:
         )
     if opinion.source == "default":
         digest = opinion.layer.GetAttributeAtPath(opinion.path).default
-        return KeyTrack((_key(prim, None, str(digest), file_opinion, None),), held, identifier)
+        return KeyTrack((_key(prim, None, str(digest), file_opinion, None),), interpolation, identifier)
     keys = []
     for layer_time in opinion.layer.ListTimeSamplesForPath(opinion.path):
         value = opinion.layer.QueryTimeSample(opinion.path, layer_time)
         digest = "" if isinstance(value, Sdf.ValueBlock) else str(value)
         keys.append(_key(prim, opinion.offset * layer_time, digest, file_opinion, layer_time))
-    return KeyTrack(tuple(keys), held, identifier)
+    return KeyTrack(tuple(keys), interpolation, identifier)
+
+
+def read_interpolation(prim: Usd.Prim) -> Interpolation:
+    """What happens between the keys of an edit.
+
+    Raises
+    ------
+    EditError
+        The token is unknown.
+    """
+    token = schema.read_attribute(prim, schema.KEY_INTERPOLATION, None)
+    try:
+        return Interpolation(token)
+    except ValueError:
+        known = ", ".join(Interpolation)
+        raise EditError(f"{prim.GetPath()}: {schema.KEY_INTERPOLATION} is '{token}', expected one of {known}") from None
 
 
 def _key(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,13 @@ from pxr import Sdf, Usd
 from icheat_usd.errors import EditError
 from icheat_usd.stage import schema
 from icheat_usd.stage.authoring import add_edit, create_stack, set_payload_key
-from icheat_usd.stage.keys import Key, KeyTrack, read_keys, strongest_opinion
+from icheat_usd.stage.key_authoring import (
+    copied_keys_are_current,
+    copy_payload_key,
+    remove_payload_key,
+    set_key_interpolation,
+)
+from icheat_usd.stage.keys import Interpolation, Key, KeyTrack, read_keys, strongest_opinion
 from tests.stage.edit_stages import DIGEST, OTHER, THIRD, layer, shot_stage
 
 FILE = "./edits.v001.icheat.h5"
@@ -208,13 +215,76 @@ def test_expression_variables_in_a_file_name_are_evaluated(tmp_path: Path) -> No
 @given(
     times=st.lists(st.integers(-1000, 1000), min_size=1, max_size=8, unique=True),
     asked=st.floats(-1100, 1100),
-    held=st.booleans(),
+    interpolation=st.sampled_from(Interpolation),
 )
-def test_weights_are_a_partition_and_reproduce_a_line(times: list[int], asked: float, held: bool) -> None:
+def test_weights_are_a_partition_and_reproduce_a_line(
+    times: list[int], asked: float, interpolation: Interpolation
+) -> None:
     ordered = sorted(times)
-    track = KeyTrack(tuple(Key(float(t), f"{i}") for i, t in enumerate(ordered)), held, "layer")
+    track = KeyTrack(tuple(Key(float(t), f"{i}") for i, t in enumerate(ordered)), interpolation, "layer")
     share = track.at(asked)
     assert abs(sum(weight for _, weight in share) - 1.0) < 1e-12 and all(weight > 0 for _, weight in share)
-    if not held:
+    if interpolation is Interpolation.LINEAR:
         value = sum(weight * float(key.time or 0.0) for key, weight in share)
         assert abs(value - min(max(asked, ordered[0]), ordered[-1])) < 1e-5
+
+
+def test_smooth_keys_ease_at_both_ends_and_meet_the_line_half_way() -> None:
+    keys = (Key(10.0, "a"), Key(20.0, "b"))
+    smooth = KeyTrack(keys, Interpolation.SMOOTH, "layer")
+    share = [{key.digest: weight for key, weight in smooth.at(t)}.get("b", 0.0) for t in range(10, 21)]
+    assert share[0] == 0.0 and share[10] == 1.0 and share[5] == 0.5
+    assert share == pytest.approx([3 * x**2 - 2 * x**3 for x in (i / 10 for i in range(11))], abs=1e-12)
+    assert share[1] < 0.03 and share[9] > 0.97
+
+
+def test_the_digest_of_a_track_tells_interpolations_apart_and_stays_what_layers_have_noted() -> None:
+    keys = (Key(1.0, DIGEST), Key(11.0, OTHER))
+    digests = {kind: KeyTrack(keys, kind, "layer").digest for kind in Interpolation}
+    assert len(set(digests.values())) == 3
+    text = repr([(1.0, DIGEST), (11.0, OTHER)])
+    assert digests[Interpolation.LINEAR] == hashlib.sha256(f"{text}False".encode()).hexdigest()
+    assert digests[Interpolation.HELD] == hashlib.sha256(f"{text}True".encode()).hexdigest()
+
+
+def test_an_unknown_interpolation_is_one_clear_error(tmp_path: Path) -> None:
+    stage = shot_stage(tmp_path)
+    prim = keyed_edit(stage, {1: DIGEST})
+    prim.GetAttribute(schema.KEY_INTERPOLATION).Set("bouncy")
+    with pytest.raises(EditError, match="is 'bouncy', expected one of linear, smooth, held"):
+        read_keys(prim)
+
+
+def test_a_key_is_copied_and_removed_and_the_last_one_stays(tmp_path: Path) -> None:
+    stage = shot_stage(tmp_path, offset=100, scale=2)
+    prim = keyed_edit(stage, {1: DIGEST, 11: OTHER})
+    copy_payload_key(stage, str(prim.GetPath()), layer="seq.usda", time=102, to=112)
+    assert key_list(prim) == [(102.0, DIGEST), (112.0, DIGEST), (122.0, OTHER)]
+    remove_payload_key(stage, str(prim.GetPath()), layer="seq.usda", time=122)
+    assert key_list(prim) == [(102.0, DIGEST), (112.0, DIGEST)]
+    with pytest.raises(EditError, match="no key at 122; it has keys at 102, 112"):
+        remove_payload_key(stage, str(prim.GetPath()), layer="seq.usda", time=122)
+    remove_payload_key(stage, str(prim.GetPath()), layer="seq.usda", time=102)
+    with pytest.raises(EditError, match="its only key is at 112"):
+        remove_payload_key(stage, str(prim.GetPath()), layer="seq.usda", time=112)
+
+
+def test_a_shot_that_removes_a_key_copies_the_others_and_notes_where_from(tmp_path: Path) -> None:
+    stage = shot_stage(tmp_path, offset=100, scale=2)
+    prim = keyed_edit(stage, {1: DIGEST, 11: OTHER, 21: THIRD})
+    before = layer(stage, "seq.usda").ExportToString()
+    remove_payload_key(stage, str(prim.GetPath()), layer="shot.usda", time=122)
+    assert key_list(prim) == [(102.0, DIGEST), (142.0, THIRD)]
+    assert layer(stage, "seq.usda").ExportToString() == before
+    assert copied_keys_are_current(prim) == (layer(stage, "seq.usda").identifier, True)
+    set_key_interpolation(stage, str(prim.GetPath()), layer="shot.usda", interpolation="smooth")
+    track = read_keys(prim)
+    assert track is not None and track.interpolation is Interpolation.SMOOTH
+    assert copied_keys_are_current(prim) == (layer(stage, "seq.usda").identifier, True)  # its keys did not change
+    layer(stage, "seq.usda").SetTimeSample(f"{prim.GetPath()}.icheat:payload", 1, THIRD)
+    assert copied_keys_are_current(prim) == (layer(stage, "seq.usda").identifier, False)
+
+
+def key_list(prim: Usd.Prim) -> list[tuple[float | None, str]]:
+    track = read_keys(prim)
+    return [(key.time, key.digest) for key in track.keys] if track else []
