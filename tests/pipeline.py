@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from icheat_usd.edits.field import EditField, bind
+from icheat_usd.edits.binding import bind
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import EMPTY_STACK, Edit, EditStack, Selection
 from icheat_usd.final_gather import FinalGather, GatherSettings, final_gather
 from icheat_usd.relight import Relighter, RelitView, build_relighter

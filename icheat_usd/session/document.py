@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from icheat_usd.edits.field import bind
+from icheat_usd.edits.binding import bind
 from icheat_usd.edits.model import EMPTY_STACK, Blend, EditStack, SurfaceMask, Value
 from icheat_usd.edits.painting import Brush, paint_mask
 from icheat_usd.errors import StageError

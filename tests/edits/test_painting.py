@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icheat_usd.edits.field import bind
+from icheat_usd.edits.binding import bind
 from icheat_usd.edits.model import Edit, EditStack, KeyedPayload, Payload, Selection
 from icheat_usd.edits.painting import paint_mask, soft_sphere
 from icheat_usd.errors import EditError

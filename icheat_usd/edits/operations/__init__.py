@@ -6,12 +6,37 @@ An operation is a small declared unit. Adding one means adding its file here
 
 from __future__ import annotations
 
-from icheat_usd.edits.operations.base import Operation, PairCoefficients, Pairs, Parameter
+from icheat_usd.edits.operations.base import (
+    BoundScene,
+    Encoding,
+    Level,
+    Measure,
+    Operation,
+    PairCoefficients,
+    PairEnd,
+    Pairs,
+    Parameter,
+    ViewCoefficients,
+)
 from icheat_usd.edits.operations.hsv import Hsv
 from icheat_usd.edits.operations.scale import Scale
 from icheat_usd.errors import EditError
 
-__all__ = ["Operation", "PairCoefficients", "Pairs", "Parameter", "find", "names", "register"]
+__all__ = [
+    "BoundScene",
+    "Encoding",
+    "Level",
+    "Measure",
+    "Operation",
+    "PairCoefficients",
+    "PairEnd",
+    "Pairs",
+    "Parameter",
+    "ViewCoefficients",
+    "find",
+    "names",
+    "register",
+]
 
 _OPERATIONS: dict[str, Operation] = {}
 

@@ -1,0 +1,166 @@
+"""Binding a stack to a scene: operations found, selections placed, parameters prepared, lights put in groups."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.edits import operations
+from icheat_usd.edits.field import BoundEdit, EditField
+from icheat_usd.edits.measures import Measures
+from icheat_usd.edits.model import Edit, EditStack, Payload, Selection, Value
+from icheat_usd.edits.operations import Measure, Operation, PairCoefficients
+from icheat_usd.edits.selection import BoundSelection, bind_selection
+from icheat_usd.errors import EditError
+from icheat_usd.scene import F32, I64, Bool, Finding, SceneSnapshot
+
+
+def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
+    """Bind the active edits of `stack` to a scene.
+
+    Raises
+    ------
+    EditError
+        An operation is unknown and no payload holds it baked, a parameter is
+        wrong, a light or an occluder does not exist, or a painted mask cannot
+        be placed on the scene.
+    """
+    group, members = _light_groups(stack, snapshot)
+    bound = [_bind_edit(edit, snapshot, members.get(edit.path)) for edit in stack.active]
+    n_groups = int(group.max(initial=0)) + 1
+    # An edit that is blocked at this time has no key left: the identity.
+    edits = tuple(edit for edit in bound if edit.n_keys)
+    edits = tuple(_with_groups(edit, n_groups) for edit in edits)
+    return EditField(edits, group, n_groups, _findings(edits))
+
+
+def _light_groups(stack: EditStack, snapshot: SceneSnapshot) -> tuple[I64, dict[str, Bool]]:
+    """Lights that no edit tells apart form a group; which groups each edit with lights of its own acts on."""
+    named = {edit.path: _named_lights(edit, snapshot) for edit in stack.active if edit.lights}
+    if not named:
+        return np.zeros(len(snapshot.light_paths), np.int64), {}
+    table = np.stack(list(named.values()), axis=1)
+    signatures, group = np.unique(table, axis=0, return_inverse=True)
+    return group.reshape(-1).astype(np.int64), {path: signatures[:, i] for i, path in enumerate(named)}
+
+
+def _named_lights(edit: Edit, snapshot: SceneSnapshot) -> Bool:
+    wanted = edit.lights
+    below = tuple(path + "/" for path in wanted)
+    found = np.array([path in wanted or path.startswith(below) for path in snapshot.light_paths], np.bool_)
+    if not found.any():
+        known = ", ".join(snapshot.light_paths[:8]) or "none"
+        raise EditError(f"{edit.path}: {', '.join(wanted)} is no light of this scene; its lights: {known}")
+    return found
+
+
+def _with_groups(bound: BoundEdit, n_groups: int) -> BoundEdit:
+    if len(bound.groups):
+        return bound
+    return replace(bound, groups=np.ones(n_groups, np.bool_))
+
+
+def _findings(edits: tuple[BoundEdit, ...]) -> tuple[Finding, ...]:
+    sources = [source for bound in edits for source in (*bound.receivers, *bound.casters, *bound.rows) if source]
+    return tuple(dict.fromkeys(finding for source in sources for finding in getattr(source, "findings", ())))
+
+
+def _bind_edit(edit: Edit, snapshot: SceneSnapshot, groups: Bool | None) -> BoundEdit:
+    operation = operations.find(edit.operation)
+    payloads: list[tuple[Payload | None, float]] = [(None, 1.0)]
+    if edit.keys:
+        payloads = [(key.payload, key.weight) for key in edit.keys if key.payload is not None]
+    rows, baked = [], []
+    for payload, _ in payloads:
+        use_rows = operation is None and payload is not None and payload.rows is not None
+        rows.append(_bind_rows(payload, snapshot, edit.path) if use_rows and payload is not None else None)
+        baked.append(_constants(payload) if operation is None and rows[-1] is None else None)
+        if operation is None and rows[-1] is None and baked[-1] is None:
+            raise EditError(
+                f"{edit.path}: operation '{edit.operation}' is unknown and no payload holds it baked;"
+                f" known are {', '.join(operations.names())}; install the package that brings it, or mute the edit"
+            )
+    # Rows have all soft weights multiplied in; what the collections say still holds.
+    masks = [(None, None) if r is not None else _masks(p) for r, (p, _) in zip(rows, payloads, strict=True)]
+    sides = [
+        tuple(
+            bind_selection(
+                Selection(selection.paths) if key_rows is not None else selection, pair[side], snapshot, edit.path
+            )
+            for key_rows, pair in zip(rows, masks, strict=True)
+        )
+        for side, selection in enumerate((edit.receivers, edit.casters))
+    ]
+    return BoundEdit(
+        edit,
+        operation,
+        parameters=tuple(
+            _prepared(operation, edit, payload, snapshot, receivers, casters)
+            for (payload, _), receivers, casters in zip(payloads, *sides, strict=True)
+        ),
+        baked=tuple(baked),
+        rows=tuple(rows),
+        receivers=sides[0],
+        casters=sides[1],
+        key_weights=tuple(weight for _, weight in payloads),
+        groups=np.zeros(0, np.bool_) if groups is None else groups,
+        occluders=_occluders(operation, edit, snapshot),
+    )
+
+
+def _masks(payload: Payload | None) -> tuple[Any, Any]:
+    return (None, None) if payload is None else (payload.receiver_mask, payload.caster_mask)
+
+
+def _bind_rows(payload: Payload, snapshot: SceneSnapshot, where: str) -> Any:
+    from icheat_usd.edits.encodings.rows import bind_rows
+
+    assert payload.rows is not None
+    return bind_rows(payload.rows, snapshot, where)
+
+
+def _constants(payload: Payload | None) -> PairCoefficients | None:
+    if payload is None or (payload.scale_delta, payload.emission, payload.offset) == (None, None, None):
+        return None
+
+    def rgb(value: tuple[float, float, float] | None) -> F32 | None:
+        return None if value is None else np.asarray(value, np.float32)[None, :]
+
+    delta = rgb(payload.scale_delta or (0.0, 0.0, 0.0))
+    assert delta is not None
+    return PairCoefficients(np.float32(1) + delta, rgb(payload.emission), rgb(payload.offset))
+
+
+def _prepared(
+    operation: Operation | None,
+    edit: Edit,
+    payload: Payload | None,
+    snapshot: SceneSnapshot,
+    receivers: BoundSelection,
+    casters: BoundSelection,
+) -> Mapping[str, Value]:
+    if operation is None:
+        return {}
+    given = dict(edit.parameters if payload is None else payload.parameters)
+    parameters = operation.complete(given, edit.path)
+    for parameter in operation.parameters:
+        value = parameters[parameter.name]
+        if parameter.measure is Measure.POINT and isinstance(value, tuple):
+            parameters[parameter.name] = tuple(float(x - c) for x, c in zip(value, snapshot.centre, strict=True))
+    return operation.prepare(parameters, Measures(snapshot, receivers, casters))
+
+
+def _occluders(operation: Operation | None, edit: Edit, snapshot: SceneSnapshot) -> Bool:
+    """Instances that the edit lets light through."""
+    below = tuple(path.rstrip("/") + "/" for path in edit.occluders)
+    named = [s.path in edit.occluders or s.path.startswith(below) for s in snapshot.surfaces]
+    surfaces = np.array(named, np.bool_)
+    if operation is not None and operation.has_through and not surfaces.any():
+        raise EditError(
+            f"{edit.path}: operation '{operation.name}' has no occluders in this scene; name the prims that light"
+            " should pass through with rel icheat:occluders, or mute the edit"
+        )
+    return surfaces[snapshot.geometry.instance_surface] if len(surfaces) else np.zeros(0, np.bool_)
