@@ -23,6 +23,8 @@ from icheat_usd.stage.parameters import (
     read_number,
     read_parameters,
 )
+from icheat_usd.stage.selections import limit_content, with_limits
+from icheat_usd.stage.spaces import in_scene_space
 from icheat_usd.stage.stacks import EditFinding, listed_edits, stack_prim, targets
 
 
@@ -113,10 +115,14 @@ def _read_edit(
         for name, selection in ((schema.RECEIVERS, edit.receivers), (schema.CASTERS, edit.casters))
         if edit.is_active and not selection.paths
     ]
-    if track is None or not edit.is_active:
+    if not edit.is_active:
         return edit, findings
-    keys = tuple(_read_key(prim, key, weight, read_payload) for key, weight in track.at(time))
-    return _with_recipes(prim, replace(edit, keys=keys), time), findings
+    edit, more = with_limits(prim, edit, time, surface_paths)
+    if track is not None:
+        keys = tuple(_read_key(prim, key, weight, read_payload) for key, weight in track.at(time))
+        edit = _with_recipes(prim, replace(edit, keys=keys), time)
+    edit, misplaced = in_scene_space(prim, edit, time)
+    return edit, [*findings, *more, *misplaced]
 
 
 def _read_key(prim: Usd.Prim, key: Key, weight: float, read_payload: PayloadReader | None) -> KeyedPayload:
@@ -201,20 +207,22 @@ def stack_digest(stack: EditStack, anchors: Mapping[str, str] = MappingProxyType
             return [float(v).hex() for v in value]
         return float(value).hex() if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
-    def surfaces(selection: Selection) -> list[str]:
-        return sorted(selection.paths)
+    def side(selection: Selection) -> object:
+        return [sorted(selection.paths), [limit_content(limit) for limit in selection.limits]]
 
     edits = [
         {
             "operation": edit.operation,
             "parameters": {name: number(value) for name, value in edit.parameters.items()},
-            "receivers": surfaces(edit.receivers),
-            "casters": surfaces(edit.casters),
+            "receivers": side(edit.receivers),
+            "casters": side(edit.casters),
             "amount": number(edit.amount),
             "blend": edit.blend.value,
             "keys": [[key.digest, number(key.weight), _recipe(key, number)] for key in edit.keys],
             "anchor": anchors.get(edit.path, "") if edit.keys else "",
             "occluders": sorted(edit.occluders),
+            "lights": sorted(edit.lights),
+            "target": None if edit.target is None else number(edit.target),
         }
         for edit in stack.active
     ]

@@ -22,18 +22,28 @@ from icheat_usd.resources import resource_path
 
 EDIT_API = "IcheatEditAPI"
 STACK_API = "IcheatStackAPI"
+SELECTION_API = "IcheatSelectionAPI"
+REGION_API = "IcheatRegionAPI"
 
 ENABLED = "icheat:enabled"
 AMOUNT = "icheat:amount"
 OPERATION = "icheat:operation"
 BLEND = "icheat:blend"
 OCCLUDERS = "icheat:occluders"
+LIGHTS = "icheat:lights"
+TARGET = "icheat:target"
+RECEIVER_LIMITS = "icheat:receiverLimits"
+CASTER_LIMITS = "icheat:casterLimits"
 ANCHOR = "icheat:anchor"
 FILE_PATH = "icheat:filePath"
 PAYLOAD = "icheat:payload"
 KEY_INTERPOLATION = "icheat:keyInterpolation"
 RECEIVERS = "icheatReceivers"
 CASTERS = "icheatCasters"
+
+RULE = "icheat:rule"
+PARTS = "icheat:parts"
+SOFTNESS = "icheat:softness"
 
 STACK_ENABLED = "icheat:stackEnabled"
 EDITS = "icheat:edits"
