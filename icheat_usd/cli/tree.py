@@ -29,11 +29,14 @@ def command(options: argparse.Namespace) -> int:
     if options.json:
         content = {"stage": options.stage, "stack": stack.path, "enabled": stack.enabled}
         edits = [edit_as_json(edit) for edit in stack.edits]
-        print_json(content | {"cameras": list(stack.cameras), "edits": edits, "missing": list(stack.missing)})
+        removed = [{"path": r.path, "listedBy": r.layer, "removedBy": r.removed_by} for r in stack.removed]
+        content |= {"cameras": list(stack.cameras), "edits": edits, "missing": list(stack.missing)}
+        print_json(content | {"removed": removed})
         return 0
     notes = [*(f"for {camera}" for camera in stack.cameras), *([] if stack.enabled else ["off"])]
     print(stack.path + (f"  ({', '.join(notes)})" if notes else ""))
     blocks = [_block(edit) for edit in stack.edits] + [[f"{name}  (missing)"] for name in stack.missing]
+    blocks += [[f"{r.path.rpartition('/')[2]}  (removed by {os.path.basename(r.removed_by)})"] for r in stack.removed]
     for index, lines in enumerate(blocks):
         last = index == len(blocks) - 1
         print(("└─ " if last else "├─ ") + lines[0])
@@ -80,7 +83,7 @@ def _block(edit: Any) -> list[str]:
 
 def edit_as_json(edit: Any) -> dict[str, Any]:
     def described(value: Any) -> dict[str, Any]:
-        return {"value": value.value, "layer": value.layer}
+        return {"value": value.value, "layer": value.layer, "source": value.source}
 
     return {
         "path": edit.path,
@@ -100,11 +103,16 @@ def edit_as_json(edit: Any) -> dict[str, Any]:
             "excludes": list(edit.casters_excluded),
             "expression": edit.casters_expression,
         },
+        "receiverLimits": list(edit.receiver_limits),
+        "casterLimits": list(edit.caster_limits),
         "occluders": list(edit.occluders),
+        "lights": list(edit.lights),
+        "target": edit.target,
         "anchor": edit.anchor,
         "keyTimes": list(edit.key_times),
         "file": edit.file,
         "payload": edit.payload_digest,
+        "listedBy": edit.listed_by,
         "layers": list(edit.layers),
         "problem": edit.problem,
     }

@@ -9,7 +9,7 @@ from icheat_usd.scene import Finding
 from icheat_usd.session.authoring import read_payload
 from icheat_usd.stage import open_stage, schema
 from icheat_usd.stage.check import check_stage
-from icheat_usd.stage.description import EditDescription, describe_edit
+from icheat_usd.stage.description import EditDescription, Listing, describe_edit, listings
 from icheat_usd.stage.opening import composition_findings
 from icheat_usd.stage.stacks import find_stack, stack_prim, stack_prims
 
@@ -23,6 +23,7 @@ class StackDescription:
     cameras: tuple[str, ...]
     edits: tuple[EditDescription, ...]
     missing: tuple[str, ...]  #: targets that do not exist or are no edits
+    removed: tuple[Listing, ...] = ()  #: what one layer lists and a stronger one takes out
 
 
 def describe_stacks(stage: Any, frame: float | None = None) -> tuple[StackDescription, ...]:
@@ -46,7 +47,7 @@ def describe_stack(stage: Any, path: str, frame: float | None = None) -> StackDe
         if not edit or (edit.IsActive() and not schema.has_schema(edit, schema.EDIT_API)):
             missing.append(str(target))
         else:
-            edits.append(describe_edit(stage, str(target), frame))
+            edits.append(describe_edit(stage, str(target), frame, prim))
     cameras = prim.GetRelationship(schema.CAMERA)
     return StackDescription(
         path=str(prim.GetPath()),
@@ -54,6 +55,7 @@ def describe_stack(stage: Any, path: str, frame: float | None = None) -> StackDe
         cameras=tuple(str(camera) for camera in cameras.GetTargets()) if cameras else (),
         edits=tuple(edits),
         missing=tuple(missing),
+        removed=tuple(listing for listing in listings(prim) if listing.removed_by),
     )
 
 

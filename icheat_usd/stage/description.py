@@ -2,26 +2,80 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
-from pxr import Usd
+from pxr import Sdf, Usd
 
 from icheat_usd.edits.model import Value
 from icheat_usd.errors import EditError
 from icheat_usd.stage import collections, schema
 from icheat_usd.stage.keys import KeyTrack, read_keys, strongest_opinion
 from icheat_usd.stage.parameters import authored_parameters
-from icheat_usd.stage.stacks import edit_prim, targets
+from icheat_usd.stage.stacks import edit_prim, stack_prims, targets
 
 
 @dataclass(frozen=True)
 class Described:
-    """A value and the layer whose opinion it is; "" for a fallback."""
+    """A value and the layer whose opinion it is; "" for a fallback.
+
+    A layer that blocks a value decides it too: the value is then the fallback.
+    """
 
     value: Value
     layer: str
+    source: str = "fallback"  #: "default", "timeSamples", "spline", "valueClips", "block" or "fallback"
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What the layers of a stack say about one of its targets."""
+
+    path: str
+    layer: str  #: identifier of the strongest layer that lists it
+    removed_by: str = ""  #: identifier of the layer that takes it out again, "" where none does
+
+
+def listings(stack: Usd.Prim) -> tuple[Listing, ...]:
+    """Who lists each edit of a stack: those that take part in their order, then those that a layer took out.
+
+    A layer takes an edit out by deleting it, or by an explicit list without it.
+    """
+    listed: dict[str, str] = {}
+    removed: dict[str, str] = {}
+    lost: dict[str, Listing] = {}
+    explicit_in = ""  # the layer whose explicit list cuts off what is weaker
+    for layer, items, mapped in _list_opinions(stack, schema.EDITS):
+        added = [mapped(path) for path in items.GetAddedOrExplicitItems()]
+        for path in (path for path in added if path):
+            if path not in listed and not explicit_in and path not in removed:
+                listed[path] = layer
+            elif path not in listed:
+                lost.setdefault(path, Listing(path, layer, removed.get(path, explicit_in)))
+        for path in map(mapped, items.deletedItems):
+            if path and path not in listed:
+                removed.setdefault(path, layer)
+        if items.isExplicit:
+            explicit_in = explicit_in or layer
+    composed = targets(stack, schema.EDITS)
+    return (*(Listing(path, listed.get(path, "")) for path in composed), *lost.values())
+
+
+def _list_opinions(prim: Usd.Prim, name: str) -> Iterator[tuple[str, Any, Callable[[Sdf.Path], str]]]:
+    """Layer, list edits and how their paths map to the stage, of every opinion on a relationship, strongest first."""
+    queried = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
+    for arc in Usd.PrimCompositionQuery(queried).GetCompositionArcs():
+        node = arc.GetTargetNode()
+
+        def mapped(path: Sdf.Path, node: Any = node) -> str:
+            return str(node.mapToRoot.MapSourceToTarget(path))
+
+        for layer in node.layerStack.layers:
+            spec = layer.GetRelationshipAtPath(node.path.AppendProperty(name))
+            if spec:
+                yield layer.identifier, spec.targetPathList, mapped
 
 
 @dataclass(frozen=True)
@@ -41,18 +95,30 @@ class EditDescription:
     casters: tuple[str, ...]
     casters_excluded: tuple[str, ...]
     casters_expression: str
+    receiver_limits: tuple[str, ...]
+    caster_limits: tuple[str, ...]
     occluders: tuple[str, ...]
+    lights: tuple[str, ...]
+    target: str
     anchor: str
     key_times: tuple[float, ...]
     keys: KeyTrack | None
     file: str  #: of the key that weighs most
     payload_digest: str
     layers: tuple[str, ...]  #: identifiers of all layers with an opinion on the prim, strongest first
+    listed_by: str = ""  #: identifier of the layer that lists it in its stack, "" where no stack does
     problem: str = ""  #: why keys cannot be read
 
 
-def describe_edit(stage: Usd.Stage, path: str, time: float | None = None) -> EditDescription:
+def describe_edit(
+    stage: Usd.Stage, path: str, time: float | None = None, stack: Usd.Prim | None = None
+) -> EditDescription:
     """Describe an edit, also an inactive one.
+
+    Parameters
+    ----------
+    stack
+        The stack that it is described as a part of; by default the first one that lists it.
 
     Raises
     ------
@@ -63,6 +129,7 @@ def describe_edit(stage: Usd.Stage, path: str, time: float | None = None) -> Edi
     prim = stage.GetPrimAtPath(path)
     if not prim or (prim.IsActive() and not schema.has_schema(prim, schema.EDIT_API)):
         prim = edit_prim(stage, path)
+    path = str(prim.GetPath())
     operation = _described(prim, schema.OPERATION, time)
     known = schema.operations().get(str(operation.value))
     names = {name: parameter.name for name, parameter in known.parameters.items()} if known else {}
@@ -74,10 +141,12 @@ def describe_edit(stage: Usd.Stage, path: str, time: float | None = None) -> Edi
     except EditError as error:
         problem = str(error)
     key = max(track.at(time), key=lambda pair: pair[1])[0] if track else None
+    stacks = [stack] if stack is not None else [s for s in stack_prims(stage) if path in targets(s, schema.EDITS)]
+    owners = [one.layer for one in listings(stacks[0]) if one.path == path and not one.removed_by] if stacks else []
     receivers, receivers_excluded, receivers_expression = collections.authored(prim, schema.RECEIVERS)
     casters, casters_excluded, casters_expression = collections.authored(prim, schema.CASTERS)
     return EditDescription(
-        path=str(prim.GetPath()),
+        path=path,
         is_active=prim.IsActive(),
         operation=operation,
         amount=_described(prim, schema.AMOUNT, time),
@@ -90,25 +159,33 @@ def describe_edit(stage: Usd.Stage, path: str, time: float | None = None) -> Edi
         casters=casters,
         casters_excluded=casters_excluded,
         casters_expression=casters_expression,
+        receiver_limits=targets(prim, schema.RECEIVER_LIMITS),
+        caster_limits=targets(prim, schema.CASTER_LIMITS),
         occluders=targets(prim, schema.OCCLUDERS),
+        lights=targets(prim, schema.LIGHTS),
+        target=(targets(prim, schema.TARGET) or ("",))[0],
         anchor=(targets(prim, schema.ANCHOR) or ("",))[0],
         key_times=track.times if track else (),
         keys=track,
         file=key.anchored if key else "",
         payload_digest=key.digest if key else "",
         layers=tuple(dict.fromkeys(spec.layer.identifier for spec in prim.GetPrimStack())),
+        listed_by=owners[0] if owners else "",
         problem=problem,
     )
 
 
 def _described(prim: Usd.Prim, name: str, time: float | None) -> Described:
-    opinion = strongest_opinion(prim.GetAttribute(name), time)
+    attribute = prim.GetAttribute(name)
+    opinion = strongest_opinion(attribute, time)
     value = schema.read_attribute(prim, name, time)
     if value is None:
         registered = schema.operations()
         value = next((p.fallback for o in registered.values() for p in o.parameters.values() if p.name == name), None)
-    converted = schema.to_value(value) if value is not None else None
-    if isinstance(value, bool):
-        converted = value
-    layer = opinion.layer.identifier if opinion and not opinion.is_blocked else ""
-    return Described("" if converted is None else converted, layer)
+    converted = None if value is None else schema.to_value(value)
+    shown = "" if converted is None else converted
+    if attribute and attribute.GetResolveInfo(schema.time_code(time)).GetSource() == Usd.ResolveInfoSourceValueClips:
+        return Described(shown, "", "valueClips")
+    if opinion is None:
+        return Described(shown, "")
+    return Described(shown, opinion.layer.identifier, "block" if opinion.is_blocked else opinion.source)
