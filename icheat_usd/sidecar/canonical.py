@@ -70,6 +70,11 @@ def digest_of(elements: Mapping[str, Element]) -> str:
     return state.hexdigest()
 
 
+def alias_check(old: str, new: str) -> str:
+    """What an alias holds beside the digest it stands for, so that damage does not lead to another payload."""
+    return hashlib.sha256(b"icheat-alias 1\n" + _text(old.encode()) + _text(new.encode())).hexdigest()
+
+
 def canonical_bytes(elements: Mapping[str, Element]) -> Iterator[bytes]:
     """The canonical bytes in blocks of bounded size; equal payloads give equal bytes whatever file holds them."""
     yield b"icheat-payload 1\n"

@@ -16,7 +16,7 @@ from icheat_usd.sidecar.values import escaped, floats, read_text, read_value, te
 RGB = tuple[float, float, float]
 
 
-# Recipe: the only element every payload has; its value fills two fields ------------------------------------------------
+# Recipe: the only element every payload has; its value fills two fields ----------------------------------------------
 
 
 @writes("recipe", "recipe", "operation")
@@ -47,7 +47,7 @@ def _read_recipe(element: Element, anchor: str) -> tuple[str, Mapping[str, Value
     return read_text(element, "operation"), MappingProxyType(parameters)
 
 
-# Rank-1 colours, the same for all pairs, that the masks multiply --------------------------------------------------------
+# Rank-1 colours, the same for all pairs, that the masks multiply ------------------------------------------------------
 
 
 def _write_rgb(type_: str, value: RGB | None, what: str) -> Element | None:
@@ -84,7 +84,7 @@ def _read_rgb(element: Element, anchor: str) -> RGB:
     return float(rgb[0]), float(rgb[1]), float(rgb[2])
 
 
-# What a payload was made against ----------------------------------------------------------------------------------------
+# What a payload was made against --------------------------------------------------------------------------------------
 
 
 @writes("made-against", "made-against", "made_against")

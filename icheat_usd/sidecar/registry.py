@@ -89,8 +89,8 @@ def check_known(name: str, type_: str, version: int, where: str) -> None:
     """
     if name in SLOTS and (type_ != SLOTS[name].type or version > newest_version(type_)):
         raise SidecarError(
-            f"{where}: element '{name}' is {type_} version {version}, and this icheat_usd reads {SLOTS[name].type} up to "
-            f"version {newest_version(SLOTS[name].type)}; update icheat_usd"
+            f"{where}: element '{name}' is {type_} version {version}, and this icheat_usd reads {SLOTS[name].type} "
+            f"up to version {newest_version(SLOTS[name].type)}; update icheat_usd"
         )
 
 

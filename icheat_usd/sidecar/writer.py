@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import h5py
@@ -18,18 +19,10 @@ import numpy as np
 from icheat_usd import __version__
 from icheat_usd.edits.model import Payload
 from icheat_usd.errors import SidecarError
-from icheat_usd.sidecar.canonical import Array, Element, digest_of
+from icheat_usd.sidecar.canonical import Array, Element, alias_check, digest_of
 from icheat_usd.sidecar.elements import encode_payload
-from icheat_usd.sidecar.reader import (
-    FORMAT,
-    FORMAT_VERSION,
-    MAX_PAYLOAD_BYTES,
-    History,
-    list_payloads,
-    open_sidecar,
-    read_elements,
-    read_history,
-)
+from icheat_usd.sidecar.guarded import FORMAT, FORMAT_VERSION
+from icheat_usd.sidecar.reader import History
 
 SUFFIX = ".icheat.h5"
 
@@ -82,59 +75,29 @@ def write_payloads(
     digests = [digest_of(elements) for elements in encoded]
     contents = dict(zip(digests, encoded, strict=True))
     entries = [History(history.who, history.why, history.when, tuple(dict.fromkeys(digests)))] if history else []
-    return _publish(Path(beside), lambda root: _fill(root, contents, entries)), digests
-
-
-def pack(files: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str]) -> tuple[Path, list[str]]:
-    """Merge the payloads of several files into one new file, elements of unknown types included.
-
-    Parameters
-    ----------
-    files : sequence of path
-        Read and verified; left as they are.
-    out : path
-        As `beside` of `write_payloads`.
-
-    Returns
-    -------
-    (Path, list of str)
-        The new file and the digests in it, sorted.
-
-    Raises
-    ------
-    SidecarError
-        As `read_payload` for what is read and `write_payloads` for what is written.
-    """
-    digests: dict[str, str] = {}
-    entries: list[History] = []
-    for file in files:
-        for digest in list_payloads(file):
-            digests.setdefault(digest, os.fspath(file))
-        entries.extend(entry for entry in read_history(file) if entry not in entries)
-    if not digests:
-        raise SidecarError(f"{os.fspath(out)}: there are no payloads to pack; name files that hold some")
-
-    def fill(root: h5py.Group) -> None:
-        _fill(root, {}, entries)
-        # One payload in memory at a time.
-        for digest, file in sorted(digests.items()):
-            with open_sidecar(file, file) as source:
-                elements = read_elements(source, digest, file, MAX_PAYLOAD_BYTES)
-            _write_payload(root["payloads"], digest, elements)
-
-    return _publish(Path(out), fill), sorted(digests)
+    return make_file(Path(beside), lambda root: fill_root(root, contents, entries)), digests
 
 
 # Contents -------------------------------------------------------------------------------------------------------------
 
 
-def _fill(root: h5py.Group, contents: Mapping[str, Mapping[str, Element]], entries: Sequence[History]) -> None:
+def fill_root(
+    root: h5py.Group,
+    contents: Mapping[str, Mapping[str, Element]],
+    entries: Sequence[History],
+    aliases: Mapping[str, str] = MappingProxyType({}),
+    *,
+    published: bool = False,
+) -> None:
+    """Everything of a file; `write_payload` may add payloads to it."""
     root.attrs["format"] = _fixed(FORMAT)
     root.attrs["format-version"] = np.int64(FORMAT_VERSION)
     root.attrs["creator"] = _fixed(f"icheat_usd {__version__}")
-    group = root.create_group("payloads")
+    if published:
+        root.attrs["published"] = np.int64(1)
+    group = root.require_group("payloads")
     for digest in sorted(contents):
-        _write_payload(group, digest, contents[digest])
+        write_payload(group, digest, contents[digest])
     history = root.create_group("history")
     for number, entry in enumerate(entries):
         place = history.create_group(f"{number:06d}")
@@ -142,8 +105,16 @@ def _fill(root: h5py.Group, contents: Mapping[str, Mapping[str, Element]], entri
             _write_dataset(place, key, np.asarray(_fixed(getattr(entry, key))))
         _write_dataset(place, "payloads", np.array([digest.encode() for digest in entry.payloads], dtype="S64"))
 
+    if aliases:
+        group = root.create_group("aliases")
+        for old, new in sorted(aliases.items()):
+            place = group.create_group(old)
+            _write_dataset(place, "payload", np.asarray(_fixed(new)))
+            _write_dataset(place, "check", np.asarray(_fixed(alias_check(old, new))))
 
-def _write_payload(group: h5py.Group, digest: str, elements: Mapping[str, Element]) -> None:
+
+def write_payload(group: h5py.Group, digest: str, elements: Mapping[str, Element]) -> None:
+    """One payload under `/payloads`."""
     payload = group.create_group(digest)
     for name, element in sorted(elements.items(), key=lambda item: item[0].encode()):
         place = payload.create_group(name)
@@ -182,8 +153,11 @@ def _fixed(value: str) -> Any:
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
-def _publish(beside: Path, fill: Callable[[h5py.Group], None]) -> Path:
-    """Make a file complete under a temporary name, then give it a name that no file has."""
+def make_file(beside: Path, fill: Callable[[h5py.Group], None], *, mode: int | None = None) -> Path:
+    """Make a file complete under a temporary name, then give it a name that no file has.
+
+    `mode` is its permissions; by default the umask decides.
+    """
     exact = beside.name.endswith(SUFFIX)
     folder = beside if beside.is_dir() else beside.parent
     stem = beside.name[: -len(SUFFIX)] if exact else ("edits" if beside.is_dir() else beside.stem)
@@ -200,6 +174,8 @@ def _publish(beside: Path, fill: Callable[[h5py.Group], None]) -> Path:
         with h5py.File(temporary, "w", libver=("v108", "v110"), locking=False) as root:
             fill(root)
         _flush(temporary)
+        if mode is not None:
+            os.chmod(temporary, mode)
         if exact:
             if not _give_name(temporary, beside):
                 raise SidecarError(f"{beside}: exists, and sidecars are never overwritten; choose an unused name")

@@ -122,7 +122,7 @@ def test_an_element_of_a_newer_version_names_itself_and_the_next_step(tmp_path: 
         digest = digest_of(elements)
         path = tmp_path / f"{name}.icheat.h5"
         with h5py.File(path, "w") as file:
-            writer._fill(file, {digest: elements}, [])
+            writer.fill_root(file, {digest: elements}, [])
         _refused(path, f"element '{name}' is {later.type} version {later.version}.*; update icheat_usd", digest)
         if later.datasets:
             packed, _ = pack([path], tmp_path / "packed.icheat.h5")

@@ -14,8 +14,7 @@ from hypothesis.extra import numpy as npst
 
 from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask
 from icheat_usd.errors import SidecarError
-from icheat_usd.sidecar import Element, pack, payload_digest, read_payload, write_payloads
-from icheat_usd.sidecar import elements, registry
+from icheat_usd.sidecar import Element, elements, pack, payload_digest, read_payload, registry, write_payloads
 from icheat_usd.sidecar.canonical import digest_of
 
 _text = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=12)

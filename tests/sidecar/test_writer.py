@@ -107,7 +107,7 @@ def test_an_interrupted_write_leaves_nothing(where: str, tmp_path: Path, monkeyp
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    target = {"fill": (writer, "_fill"), "flush": (writer, "_flush"), "name": (os, "link")}[where]
+    target = {"fill": (writer, "fill_root"), "flush": (writer, "_flush"), "name": (os, "link")}[where]
     monkeypatch.setattr(*target, interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_payloads(tmp_path / "shot.usda", [_payload(1.0)], anchor="/World")
