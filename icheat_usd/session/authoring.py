@@ -12,6 +12,7 @@ from typing import Any
 
 from icheat_usd.edits import operations
 from icheat_usd.edits.model import Blend, Payload, SurfaceMask, Value
+from icheat_usd.edits.operations.constants import BakedConstants, baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.scene import Finding
 from icheat_usd.sidecar import read_payload as read_sidecar
@@ -89,13 +90,13 @@ def add_edit(
         parameters=dict(parameters),
         receiver_mask=receiver_mask,
         caster_mask=caster_mask,
-        scale_delta=_baked(operation, parameters, f"{stack_path}/{name}"),
         made_against=made_against or {},
+        **_baked(operation, parameters, f"{stack_path}/{name}"),
     )
     beside = sidecar or target.realPath
     written: tuple[Path, str] | None = None
     if beside:
-        file, digests = write_payloads(beside, [payload], anchor=_anchor(stage))
+        file, digests = write_payloads(beside, [payload], anchor=anchor_of(stage))
         written = (file, digests[0])
     elif receiver_mask is not None or caster_mask is not None:
         raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
@@ -167,12 +168,13 @@ def surfaces_below(stage: Any, members: Members, paths: Iterable[str]) -> list[s
     return [path for path in paths if below(path, members.includes) and not below(path, members.excludes)]
 
 
-def _baked(operation: str, parameters: Mapping[str, Value], where: str) -> tuple[float, float, float] | None:
+def _baked(operation: str, parameters: Mapping[str, Value], where: str) -> BakedConstants:
     known = operations.find(operation)
-    return known.constant_delta(known.complete(parameters, where)) if known else None
+    return baked_constants(known, known.complete(parameters, where)) if known else {}
 
 
-def _anchor(stage: Any) -> str:
+def anchor_of(stage: Any) -> str:
+    """Scene path that surface paths in new payloads are relative to: the default prim's."""
     default = stage.GetDefaultPrim()
     return str(default.GetPath()) if default else "/"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from icheat_usd.edits.binding import bind
+from icheat_usd.edits.facts import facts
 from icheat_usd.edits.model import EMPTY_STACK, Blend, EditStack, SurfaceMask, Value
 from icheat_usd.edits.painting import Brush, paint_mask
 from icheat_usd.errors import StageError
@@ -333,8 +334,8 @@ class Session:
         """Only what is known without work: an edit without masks must not cost a snapshot."""
         if "snapshot" not in self.__dict__:
             return {}
-        camera = self.snapshot.camera
-        return {"camera": camera.path, "width": camera.width, "height": camera.height}
+        # Masks carry the topology of what they are painted on, and constants depend on nothing.
+        return facts(self.snapshot, authoring.anchor_of(self.stage), geometry=False, lights=False)
 
     def set_edit(self, edit: str, *, layer: str, **values: Any) -> tuple[Finding, ...]:
         """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`."""
