@@ -43,8 +43,8 @@ class Encoding(StrEnum):
 class Parameter:
     """One input of an operation: USD attribute ``icheat:<operation>:<name>``.
 
-    A default that is a tuple fixes the number of components, unless it is
-    empty: then any number will do.
+    A default that is a tuple fixes the number of components, unless the
+    parameter is an array: then any number will do.
     """
 
     name: str
@@ -53,6 +53,7 @@ class Parameter:
     minimum: float | None = None
     measure: Measure = Measure.PLAIN
     choices: tuple[str, ...] = ()  #: of a token
+    is_array: bool = False
 
 
 class PairEnd(NamedTuple):
@@ -191,7 +192,7 @@ def _checked(value: Value, parameter: Parameter, where: str) -> Value:
         fits = isinstance(value, tuple) == isinstance(expected, tuple) and all(
             isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) < float("inf") for x in components
         )
-        fits = fits and (not isinstance(expected, tuple) or not expected or len(components) == len(expected))
+        fits = fits and (not isinstance(expected, tuple) or parameter.is_array or len(components) == len(expected))
     if not fits:
         raise EditError(f"{where}: parameter '{parameter.name}' is {value!r}, expected something like {expected!r}")
     if parameter.minimum is not None and any(float(x) < parameter.minimum for x in components):

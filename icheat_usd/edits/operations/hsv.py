@@ -8,12 +8,8 @@ import numpy as np
 
 from icheat_usd.edits.model import Value
 from icheat_usd.edits.operations.base import Operation, PairCoefficients, Pairs, Parameter, number
+from icheat_usd.edits.operations.division import divide
 from icheat_usd.scene import F32
-
-#: A channel's ratio is formed where the channel holds more than this share of the pair's largest one ...
-RELATIVE_EPSILON = np.float32(1e-4)
-#: ... and is held to this, so that a faint channel cannot explode under another light.
-MAX_RATIO = np.float32(64.0)
 
 
 class Hsv(Operation):
@@ -64,19 +60,3 @@ def adjust_hsv(rgb: F32, hue: float, saturation: float, value: float) -> F32:
         k = np.mod(sector + np.float32(offset), np.float32(6))
         channels.append(new_v - new_chroma * np.clip(np.minimum(k, np.float32(4) - k), np.float32(0), np.float32(1)))
     return np.stack(channels, axis=1).astype(np.float32)
-
-
-def divide(incident: F32, wanted: F32) -> PairCoefficients:
-    """Scale and added emission that turn `incident` into `wanted` exactly.
-
-    The paper's division rule (iCheat, section 5.2) per channel with a relative
-    threshold. What no bounded ratio can reach, such as green out of a purely
-    red surface, is light that the caster adds; it travels by the same transport.
-    """
-    floor = RELATIVE_EPSILON * incident.max(axis=1, keepdims=True)
-    divisible = incident > np.maximum(floor, np.float32(0))
-    # Clipped before the division, which so cannot overflow however faint the light.
-    reached = np.minimum(wanted, MAX_RATIO * incident)
-    one = np.float32(1)
-    ratio = np.where(divisible, reached / np.where(divisible, incident, one), one).astype(np.float32)
-    return PairCoefficients(scale=ratio, emission=(wanted - ratio * incident).astype(np.float32))

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from icheat_usd.edits.model import Value
-from icheat_usd.edits.operations.base import Operation, PairCoefficients, Pairs, Parameter, number
+from icheat_usd.edits.operations.base import Encoding, Operation, PairCoefficients, Pairs, Parameter, number
+from icheat_usd.scene import F32
 
 
 class Scale(Operation):
@@ -19,11 +20,16 @@ class Scale(Operation):
         Parameter("color", (1.0, 1.0, 1.0), "Factor per channel, scene-linear", minimum=0.0),
         Parameter("gain", 1.0, "Factor for all channels", minimum=0.0),
     )
+    encodings = (Encoding.RANK_1, Encoding.RECIPE, Encoding.ROWS)
 
     def evaluate(self, parameters: Mapping[str, Value], pairs: Pairs) -> PairCoefficients:
-        color = np.asarray(parameters["color"], np.float32)
-        return PairCoefficients(scale=(np.float32(number(parameters, "gain")) * color)[None, :])
+        return self.constants(parameters)
 
-    def constant_delta(self, parameters: Mapping[str, Value]) -> tuple[float, float, float]:
-        red, green, blue = self.evaluate(parameters, Pairs(np.zeros((1, 3), np.float32))).scale[0]
-        return float(red - 1), float(green - 1), float(blue - 1)
+    def constants(self, parameters: Mapping[str, Value]) -> PairCoefficients:
+        return PairCoefficients(scaled_color(parameters, "gain"))
+
+
+def scaled_color(parameters: Mapping[str, Value], factor: str) -> F32:
+    """Parameter `color` times parameter `factor`, (1, 3)."""
+    color = np.asarray(parameters["color"], np.float32)
+    return (np.float32(number(parameters, factor)) * color)[None, :]
