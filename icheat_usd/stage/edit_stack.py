@@ -219,7 +219,7 @@ def stack_digest(stack: EditStack, anchors: Mapping[str, str] = MappingProxyType
             "amount": number(edit.amount),
             "blend": edit.blend.value,
             "keys": [[key.digest, number(key.weight), _recipe(key, number)] for key in edit.keys],
-            "anchor": anchors.get(edit.path, "") if edit.keys else "",
+            "anchor": anchors.get(edit.path, "") if any(key.digest for key in edit.keys) else "",
             "occluders": sorted(edit.occluders),
             "lights": sorted(edit.lights),
             "target": None if edit.target is None else number(edit.target),

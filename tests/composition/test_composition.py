@@ -1,0 +1,78 @@
+"""Composition is USD's alone: layers, arcs and times mean what they mean to anything else on a stage.
+
+Each case is a stage of three layers and the one layer that a person would write for the same image.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.composition import cases_of_layers
+from tests.composition.reading import read_case
+from tests.composition.stages import Case, retimed, write_case, write_flat
+
+CASES = {case.name: case for case in cases_of_layers.CASES}
+HOW = ("sublayer", "reference")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
+    """How to open each case, composed and flat."""
+    folder = tmp_path_factory.mktemp("composition")
+    return {
+        case.name: (write_case(case, folder / str(index)), write_flat(case, folder / str(index)))
+        for index, case in enumerate(CASES.values())
+    }
+
+
+@pytest.fixture(params=CASES.values(), ids=CASES.keys())
+def case(request: pytest.FixtureRequest) -> Case:
+    return request.param  # type: ignore[no-any-return]
+
+
+def test_layers_mean_what_one_layer_by_hand_means(case: Case, written: dict[str, Any]) -> None:
+    composed, flat = (read_case(opened) for opened in written[case.name])
+    assert composed["edits"] == flat["edits"]
+    assert composed["digest"] == flat["digest"] and composed["enabled"] == flat["enabled"]
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_a_scaled_layer_offset_moves_all_times(case: Case, written: dict[str, Any], how: str) -> None:
+    composed, flat = written[case.name]
+    moved = read_case(retimed(composed, how))
+    assert moved["edits"] == read_case(flat)["edits"]
+
+
+def test_the_layer_of_each_value_is_told(case: Case, written: dict[str, Any]) -> None:
+    told = read_case(written[case.name][0])
+    assert {name: told["winners"][name] for name in case.winners} == case.winners
+    assert told["removed"] == case.removed
+
+
+def test_a_host_that_composed_first_reads_the_same(written: dict[str, Any]) -> None:
+    opened = [each for composed, _ in written.values() for each in (composed, *(retimed(composed, h) for h in HOW))]
+    code = (
+        "from pxr import Usd\nUsd.Stage.CreateInMemory().DefinePrim('/composed/before', 'Scope')\n"
+        "from tests.composition.reading import main\nmain()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        input=json.dumps(opened),
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+        env={name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"},
+    )
+    assert done.returncode == 0, done.stderr
+    late = json.loads(done.stdout)
+    assert len(late) == len(opened) and not any(told.pop("registered") for told in late)
+    for each, told in zip(opened, late, strict=True):
+        here = read_case(each)
+        assert here.pop("registered") and told == here
