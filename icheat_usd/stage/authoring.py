@@ -399,19 +399,36 @@ def _set_operation(
     if found is None:
         return written
     _apply(prim, found.api_schema)
-    implementation = operations.find(operation)
+    checked = {}
     for name, value in parameters.items():
         parameter = found.parameters.get(name)
         if parameter is None:
             listed = ", ".join(sorted(found.parameters))
             raise EditError(f"{prim.GetPath()}: operation '{operation}' has no parameter '{name}'; it has {listed}")
-        checked = _checked_value(prim, parameter, value)
-        given = schema.to_value(checked)
-        if implementation is not None and given is not None:  # It may know bounds that no schema can state.
-            implementation.complete({name: given}, str(prim.GetPath()))
-        _set(prim, parameter.name, checked, time)
-        written.append(parameter.name)
+        checked[name] = _checked_value(prim, parameter, value)
+    _check_together(prim, found, checked, time)
+    for name, value in checked.items():
+        _set(prim, found.parameters[name].name, value, time)
+        written.append(found.parameters[name].name)
     return written
+
+
+def _check_together(
+    prim: Usd.Prim, operation: schema.OperationSchema, given: Mapping[str, Any], time: float | None
+) -> None:
+    """Let the operation check what is given with what is there: it may know bounds that no schema can state."""
+    implementation = operations.find(operation.name)
+    if implementation is None or not given:
+        return
+    parameters = {}
+    for known in implementation.parameters:
+        parameter = operation.parameters.get(known.name)
+        if parameter is not None:
+            value = given.get(known.name, schema.read_attribute(prim, parameter.name, time))
+            converted = None if value is None else schema.to_value(value)
+            if converted is not None:
+                parameters[known.name] = converted
+    implementation.complete(parameters, str(prim.GetPath()))
 
 
 def _checked_value(prim: Usd.Prim, parameter: schema.PropertySchema, value: Value) -> Any:
@@ -431,6 +448,8 @@ def _checked_value(prim: Usd.Prim, parameter: schema.PropertySchema, value: Valu
     numbers = tuple(value) if isinstance(value, (tuple, list)) else (value,)
     if any(isinstance(n, (bool, str)) or not isinstance(n, (int, float)) or not math.isfinite(n) for n in numbers):
         raise error
+    if parameter.type_name.isArray:
+        return type(expected)(numbers)
     if len(numbers) != max(size, 1) or bool(size) != isinstance(value, (tuple, list)):
         raise error
     return type(expected)(*numbers)

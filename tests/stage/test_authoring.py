@@ -176,7 +176,7 @@ def test_layers_outside_the_stage_and_locked_ones_are_refused(stage: Usd.Stage, 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"operation": "sale"}, "no operation is called 'sale'.*hsv, scale"),
+        ({"operation": "sale"}, "no operation is called 'sale'.*hsv, .*scale"),
         ({"parameters": {"gian": 2.0}}, "no parameter 'gian'.*color, gain"),
         ({"parameters": {"gain": (1.0, 1.0, 1.0)}}, "expected float"),
         ({"parameters": {"gain": "2"}}, "expected float"),
