@@ -14,6 +14,7 @@ from icheat_usd.scene import F32, F64, I32, I64
 from icheat_usd.stage.polygons import THINNEST, face_parametrisation, triangulate
 from icheat_usd.stage.primvars import MeshValues, Topology, expand, find_primvar, read_primvar
 from icheat_usd.stage.reporting import Reporter
+from icheat_usd.stage.skinning import Deformation
 from icheat_usd.stage.subdivision import Cage, refine
 
 #: UsdPreviewSurface's own diffuseColor, for a mesh without displayColor.
@@ -81,6 +82,7 @@ def read_mesh(
     level: int,
     report: Reporter,
     known: dict[bytes, TriangleMesh | None] | None = None,
+    deformation: Deformation | None = None,
 ) -> TriangleMesh | None:
     """Triangles of a mesh at one time, or None with a finding where its data cannot be used.
 
@@ -98,8 +100,10 @@ def read_mesh(
         Receives what is wrong or not supported.
     known
         Meshes built so far by the digest of their data: equal prims are refined once.
+    deformation
+        What moves the control points from rest to where they are.
     """
-    control = _read_control_mesh(mesh, time, materials, level, report)
+    control = _read_control_mesh(mesh, time, materials, level, report, deformation)
     if control is None:
         return None
     key = control.digest()
@@ -254,13 +258,20 @@ def unit_normals(values: F64, rows: I64, flat: F64) -> F32:
 
 
 def _read_control_mesh(
-    mesh: UsdGeom.Mesh, time: Usd.TimeCode, materials: FaceMaterials, level: int, report: Reporter
+    mesh: UsdGeom.Mesh,
+    time: Usd.TimeCode,
+    materials: FaceMaterials,
+    level: int,
+    report: Reporter,
+    deformation: Deformation | None,
 ) -> _ControlMesh | None:
     prim = mesh.GetPrim()
     topology = _read_topology(mesh, time, report)
     if topology is None:
         return None
     points, counts, indices = topology
+    if deformation is not None:
+        points = deformation.points(points)
     scheme = str(mesh.GetSubdivisionSchemeAttr().Get(time) or "catmullClark")
     if scheme == "loop":
         report(prim, "subdivisionScheme loop", "Loop subdivision is not supported; the control mesh is used, smoothed.")
@@ -280,7 +291,7 @@ def _read_control_mesh(
     wanted = [(f"st {which}", _read_values(prim, name, 2, time, sizes, report)) for which, name in enumerate(names)]
     wanted.append(("displayColor", _read_values(prim, "displayColor", 3, time, sizes, report)))
     if scheme == "none":
-        wanted.append(("normals", _read_normals(mesh, time, sizes, report)))
+        wanted.append(("normals", _read_normals(mesh, time, sizes, report, deformation)))
     st_column = np.zeros(len(counts), np.int32)
     for row in np.unique(rows):
         st_column[rows == row] = names.index(materials.st_name(int(row)))
@@ -342,15 +353,23 @@ def _read_values(
     return None if primvar is None else read_primvar(primvar, time, topology, width, report, prim)
 
 
-def _read_normals(mesh: UsdGeom.Mesh, time: Usd.TimeCode, topology: Topology, report: Reporter) -> MeshValues | None:
+def _read_normals(
+    mesh: UsdGeom.Mesh, time: Usd.TimeCode, topology: Topology, report: Reporter, deformation: Deformation | None
+) -> MeshValues | None:
     prim = mesh.GetPrim()
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
-    if primvar and primvar.HasAuthoredValue():
-        return read_primvar(primvar, time, topology, 3, report, prim)
     attribute = mesh.GetNormalsAttr()
-    if not attribute.HasAuthoredValue():
+    if primvar and primvar.HasAuthoredValue():
+        found = read_primvar(primvar, time, topology, 3, report, prim)
+    elif attribute.HasAuthoredValue():
+        interpolation = str(mesh.GetNormalsInterpolation())
+        found = expand(attribute.Get(time), None, interpolation, topology, 3, "normals", report, prim)
+    else:
         return None
-    return expand(attribute.Get(time), None, str(mesh.GetNormalsInterpolation()), topology, 3, "normals", report, prim)
+    if found is None or deformation is None:
+        return found
+    vertex = np.arange(topology.n_points) if found.on_vertices else topology.indices
+    return replace(found, values=deformation.normals(found.values, vertex, topology.n_points))
 
 
 def _shown_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode, n_faces: int, report: Reporter) -> NDArray[np.bool_]:

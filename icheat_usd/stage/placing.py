@@ -15,6 +15,7 @@ from icheat_usd.stage.materials import MaterialLibrary
 from icheat_usd.stage.meshes import FaceMaterials, TriangleMesh, read_mesh
 from icheat_usd.stage.primvars import find_primvar
 from icheat_usd.stage.reporting import Reporter
+from icheat_usd.stage.skinning import Skinning
 from icheat_usd.stage.transforms import Placement, inverse
 
 Scalar = TypeVar("Scalar", np.float32, np.int32)
@@ -55,6 +56,7 @@ class GeometryBuilder:
         self.material_purpose = material_purpose
         self.report = report
         self.xforms = UsdGeom.XformCache(time)
+        self.skinning = Skinning(time, self.xforms, report)
         self.meshes: list[TriangleMesh] = []
         self.surfaces: list[Surface] = []
         self._mesh_of: dict[tuple[object, ...], int | None] = {}
@@ -110,14 +112,14 @@ class GeometryBuilder:
 
     def _add_mesh(self, prim: Usd.Prim, materials: FaceMaterials) -> int | None:
         if prim.IsA(UsdGeom.Mesh):
-            key = self._mesh_key(prim, materials)
+            deformation = self.skinning.deformation(prim)
+            # Instances share a mesh, but each may be animated by its own means.
+            key = self._mesh_key(prim, materials) if deformation is None else (str(prim.GetPath()), materials.row)
             if key in self._mesh_of:
                 return self._mesh_of[key]
-            if prim.GetAttribute("primvars:skel:jointIndices").HasAuthoredValue():
-                self.report(prim, "skinning", "skinning is not supported; its points are used at rest.")
-            if prim.GetAttribute("skel:blendShapes").HasAuthoredValue():
-                self.report(prim, "blend shapes", "blend shapes are not supported; its points are used at rest.")
-            mesh = read_mesh(UsdGeom.Mesh(prim), self.time, materials, self.level, self.report, self._known)
+            mesh = read_mesh(
+                UsdGeom.Mesh(prim), self.time, materials, self.level, self.report, self._known, deformation
+            )
         else:
             shape = implicit.parameters(prim, self.time)
             color = implicit.display_color(prim, self.time, self.report)
@@ -154,9 +156,14 @@ class GeometryBuilder:
         placed = [(prim, mesh) for prim, mesh in zip(prims, meshes, strict=True) if mesh is not None]
         if not placed:
             return
-        matrices = np.array([self.xforms.GetLocalToWorldTransform(prim) for prim, _ in placed], dtype=np.float64)
+        matrices = np.array([self._local_to_world(prim) for prim, _ in placed], dtype=np.float64)
         names = [(str(prim.GetPath()), -1, "") for prim, _ in placed]
         self.place(np.array([mesh for _, mesh in placed]), matrices, names)
+
+    def _local_to_world(self, prim: Usd.Prim) -> Gf.Matrix4d:
+        deformation = None if prim.IsA(UsdGeom.Mesh) else self.skinning.deformation(prim)
+        moved = None if deformation is None else deformation.placement()
+        return self.xforms.GetLocalToWorldTransform(prim) if moved is None else moved
 
     def place(self, meshes: I64, matrices: F64, names: Sequence[tuple[str, int, str]]) -> None:
         """Add one surface per row.
