@@ -53,13 +53,14 @@ def fallback_parameters(operation: str) -> dict[str, Value]:
 
 
 def mix_parameters(recipes: list[tuple[Mapping[str, Value], float]]) -> dict[str, Value]:
-    """Weighted mean of numbers and vectors; of anything else what the heaviest recipe says."""
+    """Weighted mean of numbers, and of vectors of one length; of anything else what the heaviest recipe says."""
     heaviest = max(recipes, key=lambda recipe: recipe[1])[0]
     total = sum(weight for _, weight in recipes)
     mixed: dict[str, Value] = {}
     for name, value in heaviest.items():
         values = [(recipe.get(name, value), weight / total) for recipe, weight in recipes]
-        if isinstance(value, (bool, str)) or all(v == value for v, _ in values):
+        alike = all(isinstance(v, tuple) and len(v) == len(value) for v, _ in values if isinstance(value, tuple))
+        if isinstance(value, (bool, str)) or not alike or all(v == value for v, _ in values):
             mixed[name] = value
         elif isinstance(value, tuple):
             mixed[name] = tuple(sum(w * v[i] for v, w in values if isinstance(v, tuple)) for i in range(len(value)))
