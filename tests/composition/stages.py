@@ -84,13 +84,13 @@ DIGESTS = {name: payload_digest(payload, anchor="/World") for name, payload in P
 # --------------------------------------------------------------------------- snippets
 
 
-def layer(body: str, *, weaker: Sequence[str] = (), metadata: str = "", root: str = "") -> str:
-    """A layer whose default prim `World` says `body`; `root` lies beside it."""
+def layer(body: str, *, weaker: Sequence[str] = (), metadata: str = "") -> str:
+    """A layer whose default prim `World` says `body`."""
     subLayers = ", ".join(f"@./{name}@" if "@" not in name else name for name in weaker)
     return (
         '#usda 1.0\n(\ndefaultPrim = "World"\nmetersPerUnit = 1\nupAxis = "Y"\n'
         f"subLayers = [{subLayers}]\n{metadata}\n)\n"
-        f'def Xform "World"\n{{\n{body}\n}}\n{root}\n'
+        f'def Xform "World"\n{{\n{body}\n}}\n'
     )
 
 
@@ -181,8 +181,7 @@ class Case:
     time: float = 4.0
     scene: str = SCENE
     surfaces: tuple[str, ...] = SURFACES
-    root: str = ""  #: what lies beside /World in the hand-flattened layer
-    metadata: str = ""  #: of the hand-flattened layer
+    retimings: tuple[str, ...] = ("sublayer", "reference")  #: ways to bring the shot under a layer offset
 
 
 def write_case(case: Case, folder: Path) -> dict[str, object]:
@@ -213,7 +212,7 @@ def write_flat(case: Case, folder: Path) -> dict[str, object]:
     """Write the one layer that a person would have written for the same image."""
     folder.mkdir(parents=True, exist_ok=True)
     body = case.scene + case.flat
-    (folder / "flat.usda").write_text(layer(body, metadata=case.metadata, root=case.root))
+    (folder / "flat.usda").write_text(layer(body))
     if not (folder / SIDECAR).exists():
         write_payloads(folder / SIDECAR, PAYLOADS.values(), anchor="/World")
     return {

@@ -14,12 +14,11 @@ from typing import Any
 
 import pytest
 
-from tests.composition import cases_of_layers
+from tests.composition import cases_of_arcs, cases_of_layers
 from tests.composition.reading import read_case
 from tests.composition.stages import Case, retimed, write_case, write_flat
 
-CASES = {case.name: case for case in cases_of_layers.CASES}
-HOW = ("sublayer", "reference")
+CASES = {case.name: case for case in (*cases_of_layers.CASES, *cases_of_arcs.CASES)}
 
 
 @pytest.fixture(scope="module")
@@ -43,11 +42,11 @@ def test_layers_mean_what_one_layer_by_hand_means(case: Case, written: dict[str,
     assert composed["digest"] == flat["digest"] and composed["enabled"] == flat["enabled"]
 
 
-@pytest.mark.parametrize("how", HOW)
-def test_a_scaled_layer_offset_moves_all_times(case: Case, written: dict[str, Any], how: str) -> None:
+def test_a_scaled_layer_offset_moves_all_times(case: Case, written: dict[str, Any]) -> None:
     composed, flat = written[case.name]
-    moved = read_case(retimed(composed, how))
-    assert moved["edits"] == read_case(flat)["edits"]
+    for how in case.retimings:
+        moved = read_case(retimed(composed, how))
+        assert moved["edits"] == read_case(flat)["edits"]
 
 
 def test_the_layer_of_each_value_is_told(case: Case, written: dict[str, Any]) -> None:
@@ -57,7 +56,11 @@ def test_the_layer_of_each_value_is_told(case: Case, written: dict[str, Any]) ->
 
 
 def test_a_host_that_composed_first_reads_the_same(written: dict[str, Any]) -> None:
-    opened = [each for composed, _ in written.values() for each in (composed, *(retimed(composed, h) for h in HOW))]
+    opened = [
+        each
+        for case in CASES.values()
+        for each in (written[case.name][0], *(retimed(written[case.name][0], how) for how in case.retimings))
+    ]
     code = (
         "from pxr import Usd\nUsd.Stage.CreateInMemory().DefinePrim('/composed/before', 'Scope')\n"
         "from tests.composition.reading import main\nmain()\n"

@@ -1,0 +1,423 @@
+"""Cases of variants, classes, references, payloads, relocates, instances, expression variables and values in time."""
+
+from __future__ import annotations
+
+from tests.composition.cases_of_layers import (
+    ALL,
+    BLOCK,
+    HUE,
+    PILLAR,
+    ROOM,
+    WARM,
+    dim,
+    hue,
+    keyed,
+    shot,
+    warm,
+)
+from tests.composition.stages import (
+    SCENE,
+    SIDECAR,
+    STACK,
+    Case,
+    amount,
+    edit,
+    keys,
+    layer,
+    listing,
+    over,
+    select,
+    stack,
+    values,
+)
+
+
+def variants(name: str, **bodies: str) -> str:
+    """A variant set with what each variant says."""
+    each = "\n".join(f'"{variant}" {{\n{body}\n}}' for variant, body in bodies.items())
+    return f'variantSet "{name}" = {{\n{each}\n}}'
+
+
+def selecting(name: str, variant: str, declare: bool = False) -> str:
+    """Metadata that selects a variant."""
+    return f'variants = {{ string {name} = "{variant}" }}' + (f'\nprepend variantSets = "{name}"' if declare else "")
+
+
+GRADED = layer(
+    stack(
+        warm(),
+        variants(
+            "grade",
+            dusk="\n".join([over("warm", values(color=(3, 1, 0.25)), amount({1: 1, 9: 0.5})), dim(), listing("dim")]),
+            day="\n".join([over("warm", values(gain=1.5)), hue(), listing("hue", how="prepend")]),
+        ),
+        listed=["warm"],
+        metadata=selecting("grade", "dusk", declare=True),
+    ),
+    weaker=["scene.usda"],
+)
+
+#: A class above the default prim's edits that they all inherit.
+LOOK = """class Scope "_look" ( prepend apiSchemas = ["IcheatEditAPI", "IcheatScaleAPI"] )
+{
+    color3f icheat:scale:color = (2, 1, 0.5)
+    float icheat:amount = 0.5
+    append rel collection:icheatCasters:includes = </World/Block>
+}
+"""
+
+
+def library(*edits: str, body: str = "", metadata: str = "") -> str:
+    """A layer of edits to reference, which knows no scene."""
+    text = "\n".join((body, *edits))
+    return f'#usda 1.0\n(\ndefaultPrim = "Library"\n)\ndef Scope "Library" ({metadata})\n{{\n{text}\n}}\n'
+
+
+ROSY = values(color=(2, 0.8, 0.9))
+GREY = edit("grey", values("hsv", saturation=0.25), operation="hsv")
+
+
+def borrowed(name: str, *body: str, timing: str = "") -> str:
+    """An edit of the library, by reference."""
+    text = "\n".join(body)
+    return f'def "{name}" (\nprepend references = @./library/edits.usda@</Library/{name}> {timing}\n)\n{{\n{text}\n}}'
+
+
+INSTANCES = """
+    def Xform "Chair"
+    {
+        def Cube "Seat"
+        {
+            double size = 0.5
+            color3f[] primvars:displayColor = [(0.8, 0.6, 0.1)]
+            double3 xformOp:translate = (0, -1.75, 0)
+            uniform token[] xformOpOrder = ["xformOp:translate"]
+        }
+    }
+    def Xform "Left" (
+        instanceable = true
+        prepend references = </World/Chair>
+    )
+    {
+        double3 xformOp:translate = (-1, 0, 0.3)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+    def Xform "Right" (
+        instanceable = true
+        prepend references = </World/Chair>
+    )
+    {
+        double3 xformOp:translate = (1, 0, 0.3)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+"""
+SEATS = ("/World/Chair/Seat", "/World/Left/Seat", "/World/Right/Seat")
+
+#: An amount that a cubic with flat ends eases from 0 at 1 to 1 at 9: 3 x^2 - 2 x^3 at x = (time - 1) / 8.
+SPLINE = """float icheat:amount.spline = {
+    bezier,
+    1: 0; post curve (2.6666666667, 0),
+    9: 1; pre (2.6666666667, 0),
+}"""
+
+CASES = (
+    Case(
+        "the dusk grade of a stack",
+        {"sequence.usda": GRADED, "shot.usda": shot(over("dim", values(gain=0.6)))},
+        flat=stack(dim(gain=0.6), warm(amount({1: 1, 9: 0.5})), listed=["dim", "warm"]),
+        winners={
+            "warm.color": "sequence.usda",  # the opinion beside the variant, which is stronger than the one in it
+            "warm.amount": "sequence.usda",
+            "warm.amount.source": "timeSamples",
+            "dim.gain": "shot.usda",
+            "dim.listed": "sequence.usda",
+        },
+    ),
+    Case(
+        "the day grade of a stack, chosen by the shot",
+        {"sequence.usda": GRADED, "shot.usda": shot(metadata=selecting("grade", "day"))},
+        session=layer(stack(over("hue", values("hsv", hue=90)), over=True)),
+        flat=stack(hue(hue=90), warm(gain=1.5), listed=["hue", "warm"]),
+        winners={"hue.hue": "session.usda", "hue.listed": "sequence.usda", "warm.gain": "sequence.usda"},
+    ),
+    Case(
+        "a grade that the shot adds and the session chooses",
+        {
+            "sequence.usda": GRADED,
+            "shot.usda": shot(
+                variants("grade", night="\n".join([over("warm", values(gain=0.25)), hue(), listing("hue")]))
+            ),
+        },
+        session=layer(stack(over=True, metadata=selecting("grade", "night"))),
+        flat=stack(hue(), warm(gain=0.25), listed=["hue", "warm"]),
+        winners={"hue.listed": "shot.usda", "warm.gain": "shot.usda", "warm.listed": "sequence.usda"},
+    ),
+    Case(
+        "a variant of one edit",
+        {
+            "sequence.usda": layer(
+                stack(
+                    edit(
+                        "warm",
+                        variants("look", soft=amount(0.25), hard=values(color=(4, 2, 1)) + "\n" + keys("half")),
+                        receivers=[ROOM],
+                        casters=[BLOCK],
+                        metadata=selecting("look", "soft", declare=True),
+                    ),
+                    listed=["warm"],
+                ),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(over("warm", metadata=selecting("look", "hard"))),
+        },
+        flat=stack(warm(keys("half"), color=(4, 2, 1)), listed=["warm"]),
+        winners={"warm.color": "sequence.usda", "warm.keys": "sequence.usda", "warm.amount": ""},
+    ),
+    Case(
+        "edits inherit a class that the shot overrides for all of them",
+        {
+            "sequence.usda": layer(
+                LOOK
+                + stack(
+                    edit("warm", receivers=[ROOM], metadata="prepend inherits = </World/_look>"),
+                    edit("other", amount(2), receivers=[PILLAR], metadata="prepend inherits = </World/_look>"),
+                    listed=["warm", "other"],
+                ),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": layer(over("_look", values(color=(0.5, 1, 2))), weaker=["sequence.usda"]),
+        },
+        session=layer(over("_look", amount(0.75))),
+        flat=stack(
+            edit("warm", amount(0.75), color=(0.5, 1, 2), receivers=[ROOM], casters=[BLOCK]),
+            edit("other", amount(2), color=(0.5, 1, 2), receivers=[PILLAR], casters=[BLOCK]),
+            listed=["warm", "other"],
+        ),
+        winners={"warm.color": "shot.usda", "warm.amount": "session.usda", "other.amount": "sequence.usda"},
+        retimings=("sublayer",),  # Below a reference the session's class would be stronger than what an edit says.
+    ),
+    Case(
+        "an edit specializes another and keeps what it says itself",
+        {
+            "sequence.usda": layer(
+                stack(
+                    warm(amount(0.5)),
+                    edit(
+                        "hot",
+                        values(gain=2),
+                        select("Receivers", PILLAR),
+                        metadata=f"prepend specializes = <{STACK}/warm>",
+                    ),
+                    listed=["warm", "hot"],
+                ),
+                weaker=["scene.usda"],
+            ),
+            # What the shot says about the general edit is weaker than what the special one says anywhere.
+            "shot.usda": shot(over("warm", values(gain=9), amount({1: 0, 9: 1}))),
+        },
+        flat=stack(
+            warm(amount({1: 0, 9: 1}), gain=9),
+            edit("hot", amount({1: 0, 9: 1}), **(WARM | {"gain": 2, "receivers": [ROOM, PILLAR]})),  # type: ignore[arg-type]
+            listed=["warm", "hot"],
+        ),
+        winners={"hot.gain": "sequence.usda", "hot.amount": "shot.usda", "hot.color": "sequence.usda"},
+    ),
+    Case(
+        "a library's edits, referenced by the sequence and aimed by the shot",
+        {
+            "library/edits.usda": library(edit("rosy", ROSY, amount({1: 0, 9: 1})), GREY),
+            "sequence.usda": layer(
+                stack(
+                    borrowed("rosy", select("Casters", ROOM), timing="(offset = 2; scale = 0.5)"),
+                    borrowed("grey", select("Casters", PILLAR)),
+                    listed=["rosy", "grey"],
+                ),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(
+                over("rosy", select("Receivers", BLOCK, PILLAR)),
+                over("grey", select("Receivers", ROOM), values("hsv", saturation=0.5)),
+            ),
+        },
+        flat=stack(
+            edit("rosy", ROSY, amount({2.5: 0, 6.5: 1}), receivers=[BLOCK, PILLAR], casters=[ROOM]),
+            edit("grey", operation="hsv", saturation=0.5, receivers=[ROOM], casters=[PILLAR]),
+            listed=["rosy", "grey"],
+        ),
+        winners={
+            "rosy.color": "edits.usda",
+            "rosy.amount": "edits.usda",
+            "rosy.amount.source": "timeSamples",
+            "grey.saturation": "shot.usda",
+            "grey.operation": "edits.usda",
+            "rosy.listed": "sequence.usda",
+        },
+    ),
+    Case(
+        "a library's edit with keys in a sidecar beside the library",
+        {
+            "library/edits.usda": library(
+                edit("rosy", keys({1: "half", 9: "tint"}, f"@../{SIDECAR}@").replace("</World>", "</Library/Set>"))
+            ),
+            "sequence.usda": layer(
+                stack(
+                    borrowed("rosy", select("Casters", ROOM, BLOCK), "rel icheat:anchor = </World>"), listed=["rosy"]
+                ),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(over("rosy", select("Receivers", ROOM, BLOCK))),
+        },
+        flat=stack(
+            edit("rosy", keys({1: "half", 9: "tint"}), receivers=[ROOM, BLOCK], casters=[ROOM, BLOCK]), listed=["rosy"]
+        ),
+        winners={"rosy.keys": "edits.usda"},
+    ),
+    Case(
+        "a whole stack by a payload arc, whose list of edits comes along",
+        {
+            "library/edits.usda": library(
+                edit("rosy", ROSY, amount({1: 0, 9: 1})),
+                GREY,
+                body="append rel icheat:edits = [</Library/rosy>, </Library/grey>]",
+                metadata='prepend apiSchemas = ["IcheatStackAPI"]',
+            ),
+            "sequence.usda": layer(
+                'def "Edits" (\nprepend payload = @./library/edits.usda@ (scale = 0.5)\n)\n{\n'
+                + over("rosy", select("Receivers", ROOM), select("Casters", ROOM))
+                + "\n"
+                + over("grey", select("Receivers", ROOM), select("Casters", ROOM))
+                + "\n}",
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(warm(), listed=["warm"]),
+        },
+        session=layer(stack(over=True, listed=["grey"], how="delete")),
+        flat=stack(
+            edit("rosy", ROSY, amount({0.5: 0, 4.5: 1}), receivers=[ROOM], casters=[ROOM]),
+            warm(),
+            listed=["rosy", "warm"],
+        ),
+        winners={"rosy.listed": "edits.usda", "warm.listed": "shot.usda"},
+        removed={"grey": "session.usda"},
+    ),
+    Case(
+        "a reference drops targets outside of what it brings",
+        {
+            "library/edits.usda": library(edit("rosy", ROSY, receivers=["/Stage/Set", "/Library/Set"])),
+            "sequence.usda": layer(
+                stack(borrowed("rosy", select("Casters", BLOCK)), listed=["rosy"]), weaker=["scene.usda"]
+            ),
+            "shot.usda": shot(over("rosy", select("Receivers", PILLAR))),
+        },
+        flat=stack(edit("rosy", ROSY, receivers=[PILLAR], casters=[BLOCK]), listed=["rosy"]),
+        winners={"rosy.color": "edits.usda"},
+    ),
+    Case(
+        "a relocated edit is listed and overridden by its new path",
+        {
+            "library/edits.usda": library(edit("rosy", ROSY, amount(0.5))),
+            "sequence.usda": layer(
+                'def "Brought" (\nprepend references = @./library/edits.usda@\n)\n{\n}\n'
+                + stack(
+                    over("rosy", select("Receivers", ROOM), select("Casters", BLOCK), amount({1: 1, 9: 0.5})),
+                    listed=["rosy"],
+                ),
+                weaker=["scene.usda"],
+                metadata=f"relocates = {{ </World/Brought/rosy>: <{STACK}/rosy> }}",
+            ),
+            "shot.usda": shot(over("rosy", values(gain=1.5))),
+        },
+        flat=stack(
+            edit("rosy", ROSY, amount({1: 1, 9: 0.5}), gain=1.5, receivers=[ROOM], casters=[BLOCK]), listed=["rosy"]
+        ),
+        winners={"rosy.color": "edits.usda", "rosy.amount": "sequence.usda", "rosy.gain": "shot.usda"},
+    ),
+    Case(
+        "edits outside of instances select what lies in them",
+        {
+            "sequence.usda": layer(
+                stack(
+                    warm(receivers=["/World/Left"], casters=[ROOM]),
+                    dim(receivers=[ROOM], casters=["/World/Right/Seat"]),
+                    listed=ALL[:2],
+                ),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(over("warm", select("Receivers", "/World/Right/Seat"))),
+        },
+        session=layer(stack(over("warm", f"append rel collection:icheatReceivers:excludes = <{SEATS[1]}>"), over=True)),
+        flat=stack(
+            warm(receivers=[SEATS[2]], casters=[ROOM]), dim(receivers=[ROOM], casters=[SEATS[2]]), listed=ALL[:2]
+        ),
+        scene=SCENE + INSTANCES,
+        surfaces=(ROOM, BLOCK, PILLAR, *SEATS),
+    ),
+    Case(
+        "an expression variable of the shot names its own sidecar",
+        {
+            "sequence.usda": layer(
+                stack(keyed(keys({1: "half", 11: "tint"}, '@`"./${SHOT}.v001.icheat.h5"`@')), listed=["keyed"]),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": layer(
+                "", weaker=["sequence.usda"], metadata='expressionVariables = { string SHOT = "edits" }'
+            ),
+        },
+        flat=stack(keyed(keys({1: "half", 11: "tint"})), listed=["keyed"]),
+        winners={"keyed.keys": "sequence.usda"},
+        retimings=("reference",),  # The variables are those of the root layer of a stage or of what is referenced.
+    ),
+    Case(
+        "a sequence under a scaled offset, with keys and values in time",
+        {
+            "sequence.usda": layer(
+                stack(
+                    keyed(keys({1: "half", 11: "double"}), amount({1: 0.5, 11: 1})),
+                    warm(color={1: (1, 1, 1), 11: (3, 1, 0.5)}),
+                    hue(hue={1: 0, 11: 180}),
+                    listed=["keyed", "warm", "hue"],
+                ),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": layer(
+                stack(over("hue", values("hsv", saturation={0: 0, 10: 1})), over=True),  # not moved
+                weaker=["@./sequence.usda@ (offset = -1; scale = 0.5)"],
+            ),
+        },
+        flat=stack(
+            keyed(keys({-0.5: "half", 4.5: "double"}), amount({-0.5: 0.5, 4.5: 1})),
+            warm(color={-0.5: (1, 1, 1), 4.5: (3, 1, 0.5)}),
+            hue(hue={-0.5: 0, 4.5: 180}, saturation={0: 0, 10: 1}),
+            listed=["keyed", "warm", "hue"],
+        ),
+        winners={
+            "keyed.amount.source": "timeSamples",
+            "keyed.keys": "sequence.usda",
+            "hue.saturation": "shot.usda",
+            "hue.hue": "sequence.usda",
+            "warm.color.source": "timeSamples",
+        },
+    ),
+    Case(
+        "splines ease an amount and a parameter",
+        {
+            "sequence.usda": layer(
+                stack(
+                    warm(SPLINE),
+                    edit("hue", SPLINE.replace("amount", "hsv:hue"), **(HUE | {"hue": 7})),
+                    listed=["warm", "hue"],
+                ),  # type: ignore[arg-type]
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(over("hue", amount(0.5))),
+        },
+        flat=stack(warm(amount(0.31640625)), hue(amount(0.5), hue=0.31640625), listed=["warm", "hue"]),
+        winners={
+            "warm.amount": "sequence.usda",
+            "warm.amount.source": "spline",
+            "hue.hue": "sequence.usda",
+            "hue.hue.source": "spline",
+            "hue.amount": "shot.usda",
+        },
+    ),
+)
