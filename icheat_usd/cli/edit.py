@@ -18,10 +18,12 @@ from icheat_usd.cli.options import (
     add_layer,
     add_stack,
     add_stage,
+    add_why,
     assignment,
     finding_as_json,
     finding_as_text,
     print_json,
+    why,
 )
 
 
@@ -34,6 +36,7 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     add.add_argument(
         "--sidecar", metavar="FILE", help="folder or .icheat.h5 file for the payload; default by the layer"
     )
+    add_why(add)
     for side in ("receiver", "caster"):
         add.add_argument(
             f"--{side}-sphere",
@@ -133,7 +136,7 @@ def add_command(options: argparse.Namespace) -> int:
     if options.sidecar is not None:
         values["sidecar"] = options.sidecar
     values |= {"layer": layer, "parameters": dict(options.set or ()), "frame": options.frame}
-    values |= {"before": options.before, "after": options.after}
+    values |= {"before": options.before, "after": options.after, "why": why(options)}
     spheres = {side: getattr(options, f"{side}_sphere") for side in ("receiver", "caster")}
     if any(spheres.values()):
         # Painting needs the scene; an edit between whole prims does not, and works in a host without the kernels.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -28,6 +30,15 @@ def add_layer(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--layer", metavar="LAYER", help="layer of the stage to write to: path or file name; default STAGE itself"
     )
+
+
+def add_why(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--why", metavar="TEXT", help="kept in the payload's history; default the command line")
+
+
+def why(options: argparse.Namespace) -> str:
+    """What the history of a payload shall say: --why, else the command line."""
+    return options.why if options.why is not None else shlex.join(["icheat", *sys.argv[1:]])[:500]
 
 
 def add_frame(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,22 @@ from icheat_usd import __version__
 from icheat_usd.errors import IcheatError
 
 #: Modules of `icheat_usd.cli`, in the order of the help; each has a docstring (its help), `setup_parser` and `command`.
-VERBS = ("demo", "relight", "render", "stack", "edit", "tree", "cat", "check", "plugin_path")
+VERBS = (
+    "demo",
+    "relight",
+    "render",
+    "stack",
+    "edit",
+    "tree",
+    "cat",
+    "check",
+    "plugin_path",
+    "pack",
+    "publish",
+    "upgrade",
+    "gc",
+    "history",
+)
 
 CLEAN, FINDINGS, FAILURE, INTERRUPTED = 0, 1, 2, 130
 

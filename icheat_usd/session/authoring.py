@@ -15,6 +15,7 @@ from icheat_usd.edits.model import Blend, Payload, SurfaceMask, Value
 from icheat_usd.edits.operations.constants import BakedConstants, baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.scene import Finding
+from icheat_usd.session.origin import history_entry
 from icheat_usd.sidecar import read_payload as read_sidecar
 from icheat_usd.sidecar import write_payloads
 from icheat_usd.stage import authoring
@@ -66,6 +67,7 @@ def add_edit(
     before: str | None = None,
     after: str | None = None,
     sidecar: str | Path | None = None,
+    why: str = "",
 ) -> str:
     """Add an edit with its payload to a stack and save the layer.
 
@@ -75,6 +77,8 @@ def add_edit(
         None makes one, ``<default prim>/Edits``.
     sidecar : path, optional
         Folder or file for the payload; beside the layer's file by default. Needed for layers without a file.
+    why : str
+        Kept with the payload's history, beside who and when.
 
     Raises
     ------
@@ -96,7 +100,9 @@ def add_edit(
     beside = sidecar or target.realPath
     written: tuple[Path, str] | None = None
     if beside:
-        file, digests = write_payloads(beside, [payload], anchor=anchor_of(stage))
+        file, digests = write_payloads(
+            beside, [payload], anchor=anchor_of(stage), history=history_entry(why, f"{stack_path}/{name}")
+        )
         written = (file, digests[0])
     elif receiver_mask is not None or caster_mask is not None:
         raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
@@ -121,7 +127,8 @@ def add_edit(
                 after=after,
             )
             _save(stage, layer)
-    except BaseException:
+    except Exception:
+        # Not after an interruption: the layer may have been saved already, and then names this file.
         if written is not None:
             written[0].unlink(missing_ok=True)
         raise

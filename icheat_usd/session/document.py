@@ -234,7 +234,7 @@ class Session:
         field = bind(stack, self.snapshot)
         gather, radiance = None, None
         if field.uses_incident or field.has_offset:
-            gather, radiance = self.gather, self.cell_light.total()
+            gather, radiance = self.gather, self.cell_light.radiance
         result = final_gather(
             self.snapshot,
             self.tracer,
@@ -274,6 +274,7 @@ class Session:
         before: str | None = None,
         after: str | None = None,
         sidecar: str | Path | None = None,
+        why: str = "",
     ) -> str:
         """Add an edit to the stack and save the layer; a stack is made if the stage has none.
 
@@ -291,6 +292,8 @@ class Session:
             Time of the key; without it the edit holds at all times.
         sidecar : path, optional
             Folder or file for the payload; beside the layer's file by default.
+        why : str
+            Kept with the payload's history.
 
         Returns
         -------
@@ -320,6 +323,7 @@ class Session:
             before=before,
             after=after,
             sidecar=sidecar,
+            why=why,
         )
 
     def _paint(self, selected: Members | Sequence[str], brush: Brush | None) -> SurfaceMask | None:

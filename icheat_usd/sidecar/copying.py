@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -108,7 +109,7 @@ def _copy(
         raise SidecarError(f"{os.fspath(out)}: there are no payloads to pack; name files that hold some")
     entries = _about(entries, sources.keys() | aliases.keys())
     if history is not None:
-        entries.append(History(history.who, history.why, history.when, tuple(sorted(sources))))
+        entries.append(replace(history, payloads=tuple(sorted(sources))))
     written: list[str] = []
 
     def fill(root: h5py.Group) -> None:

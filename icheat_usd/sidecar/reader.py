@@ -34,8 +34,9 @@ class History:
 
     who: str = ""
     why: str = ""
-    when: str = ""
+    when: str = ""  #: UTC, as 2026-11-21T19:30:00Z
     payloads: tuple[str, ...] = ()
+    edit: str = ""  #: path of the edit that the payloads were made for
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ def read_history(file: Source, *, name: str | None = None) -> tuple[History, ...
                 values = read_dataset(dataset, f"{where}: history {number}: '{path}'", budget)
                 if values.dtype.kind == "S":
                     texts[path] = [item.decode("utf-8", "replace") for item in values.reshape(-1).tolist()]
-            one = {key: (texts.get(key) or [""])[0] for key in ("who", "why", "when")}
+            one = {key: (texts.get(key) or [""])[0] for key in ("who", "why", "when", "edit")}
             entries.append(History(**one, payloads=tuple(texts.get("payloads", ()))))
     return tuple(entries)
 
@@ -167,6 +168,6 @@ def describe(file: Source, *, name: str | None = None) -> str:
     for old, new in list_aliases(file, name=where).items():
         lines.append(f"alias {old} of {new}")
     for entry in read_history(file, name=where):
-        said = ", ".join(part for part in (entry.who, entry.when, entry.why) if part)
+        said = ", ".join(part for part in (entry.when, entry.who, entry.edit, entry.why) if part)
         lines.append(f"history  {said or '(not stated)'}: {len(entry.payloads)} payloads")
     return "\n".join([lines[0], *map(shown, lines[1:])])

@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -74,7 +75,7 @@ def write_payloads(
         raise SidecarError(f"{os.fspath(beside)}: there are no payloads to write; give at least one")
     digests = [digest_of(elements) for elements in encoded]
     contents = dict(zip(digests, encoded, strict=True))
-    entries = [History(history.who, history.why, history.when, tuple(dict.fromkeys(digests)))] if history else []
+    entries = [replace(history, payloads=tuple(dict.fromkeys(digests)))] if history else []
     return make_file(Path(beside), lambda root: fill_root(root, contents, entries)), digests
 
 
@@ -103,6 +104,8 @@ def fill_root(
         place = history.create_group(f"{number:06d}")
         for key in ("who", "why", "when"):
             _write_dataset(place, key, np.asarray(_fixed(getattr(entry, key))))
+        if entry.edit:
+            _write_dataset(place, "edit", np.asarray(_fixed(entry.edit)))
         _write_dataset(place, "payloads", np.array([digest.encode() for digest in entry.payloads], dtype="S64"))
 
     if aliases:

@@ -15,6 +15,7 @@ from pxr import Ar, Sdf, Tf, Usd
 from icheat_usd.errors import EditError, StageError
 from icheat_usd.stage import schema
 from icheat_usd.stage.keys import strongest_opinion
+from icheat_usd.stage.locking import locked
 from icheat_usd.stage.stacks import EditFinding, edit_prim
 
 #: Layers whose file is larger than this are not compared with it before the first edit.
@@ -107,16 +108,19 @@ def save_layer(layer: Sdf.Layer) -> None:
     """
     if layer.anonymous:
         raise EditError(f"layer '{layer.identifier}' has no file; export it or author in a layer that has one")
-    known = _seen_on_disk.get(layer.identifier)
-    if known is not None and _on_disk(layer) not in ("", known):
-        raise _changed(layer)
-    try:
-        saved = layer.Save()
-    except Tf.ErrorException as error:
-        raise EditError(f"{layer.realPath} cannot be saved ({_first_line(error)}); check its permissions") from error
-    if not saved:
-        raise EditError(f"{layer.realPath} cannot be saved; check its permissions")
-    _seen_on_disk[layer.identifier] = _on_disk(layer)
+    with locked(layer.realPath):
+        known = _seen_on_disk.get(layer.identifier)
+        if known is not None and _on_disk(layer) not in ("", known):
+            raise _changed(layer)
+        try:
+            saved = layer.Save()
+        except Tf.ErrorException as error:
+            raise EditError(
+                f"{layer.realPath} cannot be saved ({_first_line(error)}); check its permissions"
+            ) from error
+        if not saved:
+            raise EditError(f"{layer.realPath} cannot be saved; check its permissions")
+        _seen_on_disk[layer.identifier] = _on_disk(layer)
 
 
 def _first_line(error: Tf.ErrorException) -> str:
