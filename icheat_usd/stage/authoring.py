@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +31,17 @@ from icheat_usd.stage.layers import reload_layer as reload_layer
 from icheat_usd.stage.layers import remember_layer as remember_layer
 from icheat_usd.stage.layers import save_layer as save_layer
 from icheat_usd.stage.layers import writing as writing
+from icheat_usd.stage.selection_authoring import Members as Members
+from icheat_usd.stage.selection_authoring import add_region as add_region
+from icheat_usd.stage.selection_authoring import add_selection as add_selection
+from icheat_usd.stage.selection_authoring import (
+    apply_schema,
+    define_ancestors,
+    path_below_default,
+    set_members,
+    set_targets,
+)
 from icheat_usd.stage.stacks import EditFinding, stack_prim
-
-
-@dataclass(frozen=True)
-class Members:
-    """What a collection includes and excludes: paths of prims or collections, absolute or below the default prim."""
-
-    includes: tuple[str, ...] = ()
-    excludes: tuple[str, ...] = ()
-
 
 # --------------------------------------------------------------------------- stacks
 
@@ -69,31 +69,15 @@ def create_stack(stage: Usd.Stage, path: str, *, layer: str | Sdf.Layer, camera:
     EditError
         The place is outside the default prim or inside an instance, is a stack already, or has another type.
     """
-    default = stage.GetDefaultPrim()
-    if not default:
-        raise EditError(
-            f"{stage.GetRootLayer().identifier} has no default prim, so that references would lose the stack; "
-            f"set defaultPrim first"
-        )
-    if not Sdf.Path.IsValidPathString(path):
-        raise EditError(f"'{path}' is not a prim path; give one such as {default.GetPath()}/indirect")
-    stack_path = Sdf.Path(path).MakeAbsolutePath(default.GetPath())
-    if not stack_path.IsPrimPath() or not stack_path.HasPrefix(default.GetPath()) or stack_path == default.GetPath():
-        raise EditError(
-            f"a stack at {path} is lost when {stage.GetRootLayer().identifier} is referenced; place it below the "
-            f"default prim, such as {default.GetPath()}/indirect"
-        )
-    refuse_instances(stage, stack_path)
+    stack_path = path_below_default(stage, path, "stack")
     existing = stage.GetPrimAtPath(stack_path)
     if schema.has_schema(existing, schema.STACK_API):
         raise EditError(f"{stack_path} is a stack already; add edits to it or choose another path")
     cameras = collections.find_prims(stage, [camera], "camera") if camera is not None else ()
     with writing(stage, layer, stack_path):
-        for ancestor in stack_path.GetPrefixes()[:-1]:
-            if not stage.GetPrimAtPath(ancestor) or not stage.GetPrimAtPath(ancestor).IsDefined():
-                stage.DefinePrim(ancestor, "Scope")
+        define_ancestors(stage, stack_path)
         prim = existing if existing and existing.IsDefined() else stage.DefinePrim(stack_path, "Scope")
-        _apply(prim, schema.STACK_API)
+        apply_schema(prim, schema.STACK_API)
         for target in cameras:
             _relationship(prim, schema.CAMERA).SetTargets([target])
     return str(stack_path)
@@ -112,7 +96,11 @@ def add_edit(
     amount: float = 1.0,
     blend: Blend | str = Blend.COMPOSE,
     anchor: str | None = None,
+    receiver_limits: Sequence[str] = (),
+    caster_limits: Sequence[str] = (),
     occluders: Sequence[str] = (),
+    lights: Sequence[str] = (),
+    target: str | None = None,
     payload: tuple[str | Path, str] | None = None,
     time: float | None = None,
     before: str | None = None,
@@ -127,7 +115,13 @@ def add_edit(
     operation, parameters
         What the edit does; without a payload the operation must be a known one.
     receivers, casters
-        Paths to include, or `Members` with exclusions. A path that the stage lacks is an error.
+        Paths to include, or `Members` with exclusions or an expression. A path that the stage lacks is an error.
+    receiver_limits, caster_limits
+        Materials, regions, selections, collections or prims that narrow the two sides.
+    occluders, lights
+        Prims that the operation lets light pass, and lights that it acts on, where it has a use for them.
+    target
+        Prim that the operation aims at.
     anchor
         Prim that surface paths inside payloads are relative to; the stage's default prim if not given.
     payload
@@ -152,9 +146,9 @@ def add_edit(
     if stage.GetPrimAtPath(path):
         raise EditError(f"{path} exists already; choose another name or set its values")
     refuse_instances(stage, path)
-    with writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath()) as written_to:
         edit = stage.DefinePrim(path, "Scope")
-        _apply(edit, schema.EDIT_API)
+        apply_schema(edit, schema.EDIT_API)
         _set_operation(edit, operation, parameters or {}, time, has_payload=payload is not None)
         if amount != schema.fallback(schema.AMOUNT):
             _set_amount(edit, amount, time)
@@ -164,9 +158,9 @@ def add_edit(
             # Always authored, so that a host without our schemas selects the same.
             Usd.CollectionAPI(edit, collection).CreateIncludeRootAttr().Set(False)
             Usd.CollectionAPI(edit, collection).CreateExpansionRuleAttr().Set(Usd.Tokens.expandPrims)
-            _set_members(edit, collection, members)
-        for occluder in collections.find_prims(stage, occluders, f"{path} occluders"):
-            _append(_relationship(edit, schema.OCCLUDERS), occluder)
+            set_members(edit, collection, members)
+        related = _related(receiver_limits, caster_limits, occluders, lights, target)
+        set_targets(edit, {relationship: names for relationship, names in related.items() if names})
         anchors = (
             collections.find_prims(stage, [anchor], f"{path} anchor")
             if anchor is not None
@@ -175,10 +169,10 @@ def add_edit(
         if anchors:
             _relationship(edit, schema.ANCHOR).SetTargets([*anchors])
         if payload is not None:
-            write_key(edit, target, time, asset_path(target, os.fspath(payload[0])), payload[1])
+            write_key(edit, written_to, time, asset_path(written_to, os.fspath(payload[0])), payload[1])
         _append(_relationship(prim, schema.EDITS), path)
         if before is not None or after is not None:
-            _move(prim, path, target, before=before, after=after)
+            _move(prim, path, written_to, before=before, after=after)
     return str(path)
 
 
@@ -295,9 +289,14 @@ def set_edit(
     enabled: bool | None = None,
     receivers: Members | Sequence[str] | None = None,
     casters: Members | Sequence[str] | None = None,
+    receiver_limits: Sequence[str] | None = None,
+    caster_limits: Sequence[str] | None = None,
+    occluders: Sequence[str] | None = None,
+    lights: Sequence[str] | None = None,
+    target: str | None = None,
     time: float | None = None,
 ) -> tuple[EditFinding, ...]:
-    """Author values of an edit; what is None stays as it is.
+    """Author values of an edit; what is None stays as it is, an empty list or target takes away.
 
     A selection is authored as the difference from the composed one, so that
     later additions of weaker layers still join it.
@@ -315,7 +314,7 @@ def set_edit(
     prim = writable_edit(stage, edit)
     written: list[str] = []
     selections: list[EditFinding] = []
-    with writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath()) as written_to:
         if operation is not None or parameters:
             token = operation or str(schema.read_attribute(prim, schema.OPERATION, time))
             has_payload = strongest_opinion(prim.GetAttribute(schema.PAYLOAD)) is not None
@@ -332,10 +331,13 @@ def set_edit(
             _set(prim, schema.ENABLED, bool(enabled))
             written.append(schema.ENABLED)
         for collection, members in ((schema.RECEIVERS, receivers), (schema.CASTERS, casters)):
-            if members is not None and not _set_members(prim, collection, members):
-                message = f"authored in {target.identifier}, but a stronger layer changes the selection"
+            if members is not None and not set_members(prim, collection, members):
+                message = f"authored in {written_to.identifier}, but a stronger layer changes the selection"
                 selections.append(EditFinding(str(prim.GetPath()), collection, message))
-    return (*overridden_opinions(prim, target, written, time), *selections)
+        for name in set_targets(prim, _related(receiver_limits, caster_limits, occluders, lights, target)):
+            message = f"authored in {written_to.identifier}, but a stronger layer changes the targets"
+            selections.append(EditFinding(str(prim.GetPath()), name, message))
+    return (*overridden_opinions(prim, written_to, written, time), *selections)
 
 
 def mute_edit(stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, muted: bool = True) -> tuple[EditFinding, ...]:
@@ -343,12 +345,21 @@ def mute_edit(stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, muted: boo
     return set_edit(stage, edit, layer=layer, enabled=not muted)
 
 
-def _apply(prim: Usd.Prim, name: str) -> None:
-    allowed = prim.CanApplyAPI(name)
-    if not allowed:
-        raise EditError(f"{prim.GetPath()} ({prim.GetTypeName() or 'untyped'}) cannot take {name}: {allowed.whyNot}")
-    if not schema.has_schema(prim, name):
-        prim.ApplyAPI(name)
+def _related(
+    receiver_limits: Sequence[str] | None,
+    caster_limits: Sequence[str] | None,
+    occluders: Sequence[str] | None,
+    lights: Sequence[str] | None,
+    target: str | None,
+) -> dict[str, Sequence[str] | None]:
+    """Targets by relationship; None leaves one as it is, an empty target is none."""
+    return {
+        schema.RECEIVER_LIMITS: receiver_limits,
+        schema.CASTER_LIMITS: caster_limits,
+        schema.OCCLUDERS: occluders,
+        schema.LIGHTS: lights,
+        schema.TARGET: None if target is None else [target] if target else [],
+    }
 
 
 def _relationship(prim: Usd.Prim, name: str) -> Usd.Relationship:
@@ -398,7 +409,7 @@ def _set_operation(
         _set(prim, schema.OPERATION, operation)
     if found is None:
         return written
-    _apply(prim, found.api_schema)
+    apply_schema(prim, found.api_schema)
     checked = {}
     for name, value in parameters.items():
         parameter = found.parameters.get(name)
@@ -453,31 +464,3 @@ def _checked_value(prim: Usd.Prim, parameter: schema.PropertySchema, value: Valu
     if len(numbers) != max(size, 1) or bool(size) != isinstance(value, (tuple, list)):
         raise error
     return type(expected)(*numbers)
-
-
-def _set_members(prim: Usd.Prim, name: str, members: Members | Sequence[str]) -> bool:
-    """Make a collection include and exclude just `members`; False if stronger layers keep it otherwise."""
-    if isinstance(members, str):
-        raise EditError(f"{prim.GetPath()} {name}: expected a list of paths, got the text '{members}'")
-    wanted = members if isinstance(members, Members) else Members(tuple(members))
-    collection = Usd.CollectionAPI(prim, name)
-    where = f"{prim.GetPath()} {name}"
-    includes = _author_difference(
-        collection.GetIncludesRel(), collections.find_prims(prim.GetStage(), wanted.includes, where)
-    )
-    excludes = _author_difference(
-        collection.GetExcludesRel(), collections.find_prims(prim.GetStage(), wanted.excludes, where)
-    )
-    return includes and excludes
-
-
-def _author_difference(relationship: Usd.Relationship, wanted: tuple[Sdf.Path, ...]) -> bool:
-    """Make the composed targets `wanted`; False if stronger layers keep them otherwise."""
-    composed = relationship.GetTargets()
-    for path in composed:
-        if path not in wanted:
-            relationship.RemoveTarget(path)
-    for path in wanted:
-        if path not in composed:
-            _append(relationship, path)
-    return set(relationship.GetTargets()) == set(wanted)
