@@ -9,7 +9,8 @@ from icheat_usd.scene import Finding
 from icheat_usd.session.authoring import read_payload
 from icheat_usd.stage import open_stage, schema
 from icheat_usd.stage.check import check_stage
-from icheat_usd.stage.description import EditDescription, Listing, describe_edit, listings
+from icheat_usd.stage.description import EditDescription, describe_edit
+from icheat_usd.stage.list_edits import Listing, listings
 from icheat_usd.stage.opening import composition_findings
 from icheat_usd.stage.stacks import find_stack, stack_prim, stack_prims
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
-from pxr import Sdf, Usd
+from pxr import Usd
 
 from icheat_usd.edits.model import Value
 from icheat_usd.errors import EditError
 from icheat_usd.stage import collections, schema
 from icheat_usd.stage.keys import KeyTrack, read_keys, strongest_opinion
+from icheat_usd.stage.list_edits import listings
 from icheat_usd.stage.parameters import authored_parameters
 from icheat_usd.stage.stacks import edit_prim, stack_prims, targets
 
@@ -27,55 +27,6 @@ class Described:
     value: Value
     layer: str
     source: str = "fallback"  #: "default", "timeSamples", "spline", "valueClips", "block" or "fallback"
-
-
-@dataclass(frozen=True)
-class Listing:
-    """What the layers of a stack say about one of its targets."""
-
-    path: str
-    layer: str  #: identifier of the strongest layer that lists it
-    removed_by: str = ""  #: identifier of the layer that takes it out again, "" where none does
-
-
-def listings(stack: Usd.Prim) -> tuple[Listing, ...]:
-    """Who lists each edit of a stack: those that take part in their order, then those that a layer took out.
-
-    A layer takes an edit out by deleting it, or by an explicit list without it.
-    """
-    listed: dict[str, str] = {}
-    removed: dict[str, str] = {}
-    lost: dict[str, Listing] = {}
-    explicit_in = ""  # the layer whose explicit list cuts off what is weaker
-    for layer, items, mapped in _list_opinions(stack, schema.EDITS):
-        added = [mapped(path) for path in items.GetAddedOrExplicitItems()]
-        for path in (path for path in added if path):
-            if path not in listed and not explicit_in and path not in removed:
-                listed[path] = layer
-            elif path not in listed:
-                lost.setdefault(path, Listing(path, layer, removed.get(path, explicit_in)))
-        for path in map(mapped, items.deletedItems):
-            if path and path not in listed:
-                removed.setdefault(path, layer)
-        if items.isExplicit:
-            explicit_in = explicit_in or layer
-    composed = targets(stack, schema.EDITS)
-    return (*(Listing(path, listed.get(path, "")) for path in composed), *lost.values())
-
-
-def _list_opinions(prim: Usd.Prim, name: str) -> Iterator[tuple[str, Any, Callable[[Sdf.Path], str]]]:
-    """Layer, list edits and how their paths map to the stage, of every opinion on a relationship, strongest first."""
-    queried = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
-    for arc in Usd.PrimCompositionQuery(queried).GetCompositionArcs():
-        node = arc.GetTargetNode()
-
-        def mapped(path: Sdf.Path, node: Any = node) -> str:
-            return str(node.mapToRoot.MapSourceToTarget(path))
-
-        for layer in node.layerStack.layers:
-            spec = layer.GetRelationshipAtPath(node.path.AppendProperty(name))
-            if spec:
-                yield layer.identifier, spec.targetPathList, mapped
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from icheat_usd.edits.model import EditStack, Payload
 from icheat_usd.sidecar import read_payload
 from icheat_usd.stage import schema
 from icheat_usd.stage.check import check_stage
-from icheat_usd.stage.description import describe_edit, listings
+from icheat_usd.stage.description import describe_edit
 from icheat_usd.stage.edit_stack import read_edit_stack
+from icheat_usd.stage.list_edits import listings
 from icheat_usd.stage.stacks import find_stack, stack_prim
 
 
