@@ -108,7 +108,7 @@ class Pipeline:
             field,
             settings=settings,
             gather=self.gather if needs else None,
-            gather_radiance=self.cell_light.total() if needs else None,
+            gather_radiance=self.cell_light.radiance if needs else None,
         )
 
 

@@ -143,7 +143,10 @@ class EditField:
     @property
     def uses_incident(self) -> bool:
         """True if S depends on the colour of the light, so that a renderer must supply it."""
-        return any(bound.operation is not None and bound.operation.uses_incident for bound in self.edits)
+        return any(
+            bound.level is Level.PAIR and bound.operation is not None and bound.operation.uses_incident
+            for bound in self.edits
+        )
 
     @property
     def uses_receiver(self) -> bool:
@@ -185,6 +188,11 @@ class EditField:
     @property
     def n_rows(self) -> int:
         return sum(bound.n_keys for bound in self.edits)
+
+    def rows_of(self, edit: int) -> slice:
+        """Rows of the masks that belong to an edit."""
+        first = sum(bound.n_keys for bound in self.edits[:edit])
+        return slice(first, first + self.edits[edit].n_keys)
 
     # Points
 

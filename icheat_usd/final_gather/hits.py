@@ -1,32 +1,41 @@
-"""Light that leaves the surfaces which gather rays hit."""
+"""Gather rays, and the light that leaves the surfaces which they hit."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.kernels.gather import uniforms
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.samples import cosine_rays
+from icheat_usd.kernels.transport import point_sets
 from icheat_usd.lighting import LightSampler, irradiance
-from icheat_usd.materials import effective_albedo, nonzero_rows, take_points
+from icheat_usd.materials import effective_albedo, nonzero_rows, sample_specular, take_points
 from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
+from icheat_usd.transport import sum_groups
 
 INVERSE_PI = np.float32(1.0 / np.pi)
 
 
+class GatherRays(NamedTuple):
+    """Rays from points, each followed to the first surface that scatters."""
+
+    ends: SurfacePoints  #: (n,) instance -1 where a ray left the scene
+    throughput: F32  #: (n, 3) of the delta vertices in between and of the lobe; 0 where there is no end
+    origins: F32  #: (n, 3)
+    directions: F32  #: (n, 3)
+    seed: int  #: of the choices at delta vertices, for `first_surfaces`
+    reflectance: F32 | None = None  #: (n, 3) the lobe's share of `throughput`; None is 1
+
+
 def trace_hemisphere(
     snapshot: SceneSnapshot, tracer: Tracer, points: SurfacePoints, stream: I64, n_rays: int, seed: int
-) -> tuple[SurfacePoints, F32]:
-    """Cosine-weighted rays from each point to the first surfaces that scatter.
+) -> GatherRays:
+    """`n_rays` cosine-weighted rays from each point, in the order of the points.
 
-    Returns
-    -------
-    points : SurfacePoints
-        (n * n_rays,) in the order of the rays.
-    throughput : (n * n_rays, 3) float32
-        Of the delta vertices in between; 0 where a ray left the scene or
-        pointed below the geometric surface.
+    Rays that would point below the geometric surface have throughput 0.
     """
     n = len(stream)
     origins, directions = np.empty((n * n_rays, 3), np.float32), np.empty((n * n_rays, 3), np.float32)
@@ -42,8 +51,39 @@ def trace_hemisphere(
         origins,
         directions,
     )
-    ends = first_surfaces(snapshot, tracer, origins, directions, int(hash_combine(seed, 1)))
-    return ends.points, ends.throughput * (ends.points.instance >= 0)[:, None]
+    seed = int(hash_combine(seed, 1))
+    ends = first_surfaces(snapshot, tracer, origins, directions, seed)
+    return GatherRays(ends.points, ends.throughput * (ends.points.instance >= 0)[:, None], origins, directions, seed)
+
+
+def trace_specular(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    points: SurfacePoints,
+    to_eye: F32,
+    stream: I64,
+    n_rays: int,
+    seed: int,
+) -> GatherRays:
+    """`n_rays` rays from each point that follow its specular lobe; the lobe's weight is in their throughput."""
+    repeated = take_points(points, np.repeat(np.arange(len(stream)), n_rays))
+    u = np.empty((len(stream) * n_rays, 2), np.float32)
+    point_sets(seed, stream, n_rays, u)
+    directions, base_weight, edge_weight = sample_specular(repeated, np.repeat(to_eye, n_rays, axis=0), u)
+    origins = spawn_points(snapshot, repeated, directions)
+    seed = int(hash_combine(seed, 1))
+    ends = first_surfaces(snapshot, tracer, origins, directions, seed)
+    reflectance = base_weight[:, None] * repeated.specular + edge_weight[:, None] * repeated.specular_edge
+    lit = (ends.points.instance >= 0)[:, None]
+    throughput = np.where(lit, reflectance * ends.throughput, np.float32(0)).astype(np.float32)
+    return GatherRays(ends.points, throughput, origins, directions, seed, reflectance)
+
+
+class Reflected(NamedTuple):
+    """Diffuse radiance that n points reflect."""
+
+    total: F32  #: (n, 3)
+    by_group: F32  #: (G, n, 3) of each group of lights; the same array where there is only one
 
 
 def reflected_radiance(
@@ -55,7 +95,9 @@ def reflected_radiance(
     *,
     n_bounces: int,
     seed: int,
-) -> F32:
+    light_group: I64 | None = None,
+    n_groups: int = 1,
+) -> Reflected:
     """Diffuse radiance that each point reflects, by one path per point.
 
     Emission is not in it: emissive meshes and domes count as direct light.
@@ -67,12 +109,16 @@ def reflected_radiance(
         (n,) hits of gather rays; those with `throughput` 0 are skipped.
     throughput : (n, 3) float32
         Carried into the result.
+    light_group : (n_lights,), optional
+        Group of each light, where there are several; paths and `total` do not depend on it.
 
     Returns
     -------
-    (n, 3) float32, radiance, scene-linear
+    Reflected
+        Radiance, scene-linear.
     """
     result = np.zeros_like(throughput)
+    by_group = result[None] if n_groups == 1 else np.zeros((n_groups, *throughput.shape), np.float32)
     alive = np.flatnonzero(nonzero_rows(throughput))
     carried = np.take(throughput, alive, axis=0)
     points = take_points(points, alive)
@@ -81,8 +127,13 @@ def reflected_radiance(
             break
         step_seed = int(hash_combine(seed, bounce))
         albedo = effective_albedo(points)
-        received = irradiance(snapshot, tracer, sampler, points, step_seed, 1).sum(axis=0)
+        per_light = irradiance(snapshot, tracer, sampler, points, step_seed, 1)
+        received = per_light.sum(axis=0)
         result[alive] += carried * albedo * received * INVERSE_PI
+        if n_groups > 1:
+            assert light_group is not None
+            of_groups = sum_groups(per_light, light_group, n_groups)
+            by_group[:, alive] += carried * albedo * of_groups * INVERSE_PI
         if bounce + 1 == n_bounces:
             break
         carried = carried * albedo
@@ -94,8 +145,8 @@ def reflected_radiance(
         lives = np.flatnonzero(chance < survival)
         alive, points = alive[lives], take_points(points, lives)
         carried = np.take(carried, lives, axis=0) / survival[lives, None]
-        points, through = trace_hemisphere(snapshot, tracer, points, alive, 1, int(hash_combine(step_seed, 2)))
-        carried = carried * through
+        rays = trace_hemisphere(snapshot, tracer, points, alive, 1, int(hash_combine(step_seed, 2)))
+        carried, points = carried * rays.throughput, rays.ends
         lives = np.flatnonzero(nonzero_rows(carried))
         alive, carried, points = alive[lives], np.take(carried, lives, axis=0), take_points(points, lives)
-    return result
+    return Reflected(result, by_group)

@@ -9,34 +9,30 @@ left out of the lighting, as shadow rays pass straight through it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.edits.field import EditField
-from icheat_usd.edits.offsets import offset_radiance
+from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
-from icheat_usd.final_gather.hits import reflected_radiance, trace_hemisphere
+from icheat_usd.final_gather.gatherer import Gatherer, GatherSolution, gathered_light
+from icheat_usd.final_gather.hits import trace_hemisphere
 from icheat_usd.kernels.random import hash_combine
-from icheat_usd.kernels.transport import point_sets
-from icheat_usd.lighting import LightSampler, build_light_sampler, reflected_direct, samples_per_light
-from icheat_usd.materials import concatenate_points, is_glossy, sample_specular, take_points
+from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
+from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
 from icheat_usd.samples.develop import average, develop
-from icheat_usd.scene import F32, F64, I64, Bool, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
+from icheat_usd.scene import F32, F64, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, build_tracer
+from icheat_usd.transport import sum_groups
 
 #: Gather rays in flight; bounds memory and keeps a chunk's arrays near the caches.
 RAYS_AT_ONCE = 1 << 19
 
 #: Where pilot points are taken from in the picture, at most.
 PILOT_ROWS, PILOT_COLUMNS = 24, 128
-
-#: Light that leaves points on casters as the edits should see its colour, free of noise: (n,) points -> (n, 3).
-IncidentColor = Callable[[SurfacePoints], F32]
 
 
 @dataclass(frozen=True)
@@ -65,25 +61,6 @@ class FinalGather:
     depth: F64
 
 
-class _Light(NamedTuple):
-    base: F32  #: (n, 3) indirect radiance without edits
-    edited: F32  #: (n, 3) with them
-
-
-@dataclass(frozen=True, eq=False)
-class _Gatherer:
-    """What every chunk of the gather needs."""
-
-    snapshot: SceneSnapshot
-    tracer: Tracer
-    sampler: LightSampler
-    field: EditField
-    incident_color: IncidentColor | None
-    offsets: GatherSamples | None
-    offset_radiance: F32 | None
-    settings: GatherSettings
-
-
 def final_gather(
     snapshot: SceneSnapshot,
     tracer: Tracer,
@@ -104,10 +81,11 @@ def final_gather(
     ----------
     field : EditField
         The stack, bound to this snapshot.
-    gather, gather_radiance : GatherSamples and (n_gather, 3) float32, optional
-        The gather-sample solution of the relighter. Needed by operations that
-        depend on the colour of the light, whose ratio must not be formed from
-        single noisy rays, and by offsets, which are integrated over area.
+    gather, gather_radiance : GatherSamples and (n_lights, n_gather, 3) float32, optional
+        The gather-sample solution of the relighter, per light. Needed by
+        operations that depend on the colour of the light, whose ratio must not
+        be formed from single noisy rays, and by offsets, which are integrated
+        over area.
 
     Raises
     ------
@@ -116,12 +94,18 @@ def final_gather(
     """
     if (field.uses_incident or field.has_offset) and (gather is None or gather_radiance is None):
         raise EditError("the edit stack needs the gather-sample solution: pass gather and gather_radiance")
-    incident = None
-    if gather is not None and gather_radiance is not None:
-        incident = _incident_from(gather, gather_radiance)
     progress("gather", 0.0)
     sampler = build_light_sampler(snapshot, tracer, _pilot_points(snapshot, tracer, settings.seed), settings.seed)
-    gatherer = _Gatherer(snapshot, tracer, sampler, field, incident, gather, gather_radiance, settings)
+    gatherer = Gatherer(
+        snapshot,
+        tracer,
+        sampler,
+        settings.gather_rays,
+        settings.n_bounces,
+        field,
+        _solution(field, gather, gather_radiance),
+        tuple(build_tracer(snapshot, tracer.engine, hidden=field.edits[edit].occluders) for edit in field.throughs),
+    )
     n_pixels = snapshot.camera.width * snapshot.camera.height
     band = max(RAYS_AT_ONCE // (settings.samples_per_pixel * max(settings.gather_rays, 1)), 1)
     bands: list[dict[str, F64]] = []
@@ -136,7 +120,7 @@ def final_gather(
             max_splits=0,
             pixels=pixels,
         )
-        bands.append(_band(gatherer, view, pixels, int(hash_combine(settings.seed, first))))
+        bands.append(_band(gatherer, view, settings, pixels, int(hash_combine(settings.seed, first))))
     progress("gather", 1.0)
     shape = (snapshot.camera.height, snapshot.camera.width, -1)
     layers = {name: np.concatenate([part[name] for part in bands]).reshape(shape) for name in bands[0]}
@@ -156,22 +140,22 @@ def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> Surface
     found = [points]
     for bounce, n_rays in enumerate((4, 1)):
         stream = np.arange(len(points.instance), dtype=np.int64)
-        points, through = trace_hemisphere(
-            snapshot, tracer, points, stream, n_rays, int(hash_combine(seed, 20 + bounce))
-        )
-        points = take_points(points, np.flatnonzero(through.any(axis=1)))
+        rays = trace_hemisphere(snapshot, tracer, points, stream, n_rays, int(hash_combine(seed, 20 + bounce)))
+        points = take_points(rays.ends, np.flatnonzero(rays.throughput.any(axis=1)))
         found.append(points)
     return concatenate_points(*found)
 
 
-def _incident_from(gather: GatherSamples, radiance: F32) -> IncidentColor:
-    def color(points: SurfacePoints) -> F32:
-        return radiance[gather.locate(points)]
+def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | None) -> GatherSolution | None:
+    if gather is None or per_light is None:
+        return None
+    b = sum_groups(per_light, field.light_group, field.n_groups)
+    return GatherSolution(gather, b, offset_casters(field, field.casters(gather.points), b, gather.area))
 
-    return color
 
-
-def _band(gatherer: _Gatherer, view: ViewSamples, pixels: tuple[int, int], seed: int) -> dict[str, F64]:
+def _band(
+    gatherer: Gatherer, view: ViewSamples, settings: GatherSettings, pixels: tuple[int, int], seed: int
+) -> dict[str, F64]:
     """Layers of some of the pixels, (n_pixels, k) each."""
     direct = reflected_direct(
         gatherer.snapshot,
@@ -180,9 +164,9 @@ def _band(gatherer: _Gatherer, view: ViewSamples, pixels: tuple[int, int], seed:
         view.points,
         view.to_eye,
         seed,
-        samples_per_light(gatherer.snapshot, gatherer.settings.light_samples, gatherer.settings.dome_samples),
+        samples_per_light(gatherer.snapshot, settings.light_samples, settings.dome_samples),
     ).sum(axis=0)
-    light = _indirect(gatherer, view.points, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
+    light = gathered_light(gatherer, view.points, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
     return {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),
@@ -193,104 +177,3 @@ def _band(gatherer: _Gatherer, view: ViewSamples, pixels: tuple[int, int], seed:
         "normal": average(view, view.points.shading_normal, pixels),
         "depth": average(view, view.depth[:, None], pixels),
     }
-
-
-def _indirect(gatherer: _Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, seed: int) -> _Light:
-    """Indirect radiance that the points send to the eye, unedited and edited."""
-    receiver = gatherer.field.receiver_masks(points)
-    touched: Bool = np.asarray((receiver > 0).any(axis=0), np.bool_)
-    n_rays = gatherer.settings.gather_rays
-    hits, through = trace_hemisphere(gatherer.snapshot, gatherer.tracer, points, stream, n_rays, seed)
-    diffuse = _sum_rays(gatherer, hits, through, receiver, touched, n_rays, seed)
-    base = points.albedo * diffuse.base
-    edited = points.albedo * diffuse.edited
-    glossy = np.flatnonzero(is_glossy(points))
-    if len(glossy):
-        specular = _specular(
-            gatherer,
-            take_points(points, glossy),
-            to_eye[glossy],
-            stream[glossy],
-            receiver[:, glossy],
-            touched[glossy],
-            seed,
-        )
-        base[glossy] += specular.base
-        edited[glossy] += specular.edited
-    if gatherer.field.has_offset and touched.any():
-        which = np.flatnonzero(touched)
-        gather, b = gatherer.offsets, gatherer.offset_radiance
-        assert gather is not None and b is not None
-        casters = gatherer.field.caster_masks(gather.points)
-        albedo = points.albedo[which]
-        edited[which] += offset_radiance(gatherer.field, b, gather.area, receiver[:, which], casters, albedo)
-    edited = np.where(touched[:, None], np.maximum(edited, np.float32(0)), base)
-    return _Light(base, edited)
-
-
-def _specular(
-    gatherer: _Gatherer,
-    points: SurfacePoints,
-    to_eye: F32,
-    stream: I64,
-    receiver: F32,
-    touched: Bool,
-    seed: int,
-) -> _Light:
-    """The specular lobe's share, by rays that follow the lobe."""
-    n_rays = gatherer.settings.gather_rays
-    seed = int(hash_combine(seed, 7))
-    repeated = take_points(points, np.repeat(np.arange(len(stream)), n_rays))
-    u = _lobe_numbers(stream, n_rays, seed)
-    directions, base_weight, edge_weight = sample_specular(repeated, np.repeat(to_eye, n_rays, axis=0), u)
-    ends = first_surfaces(
-        gatherer.snapshot,
-        gatherer.tracer,
-        spawn_points(gatherer.snapshot, repeated, directions),
-        directions,
-        int(hash_combine(seed, 1)),
-    )
-    reflectance = base_weight[:, None] * repeated.specular + edge_weight[:, None] * repeated.specular_edge
-    lit = (ends.points.instance >= 0)[:, None]
-    through = np.where(lit, reflectance * ends.throughput, np.float32(0)).astype(np.float32)
-    return _sum_rays(gatherer, ends.points, through, receiver, touched, n_rays, int(hash_combine(seed, 2)))
-
-
-def _lobe_numbers(stream: I64, n_rays: int, seed: int) -> F32:
-    out = np.empty((len(stream) * n_rays, 2), np.float32)
-    point_sets(seed, stream, n_rays, out)
-    return out
-
-
-def _sum_rays(
-    gatherer: _Gatherer, hits: SurfacePoints, through: F32, receiver: F32, touched: Bool, n_rays: int, seed: int
-) -> _Light:
-    """Mean over each point's rays of the light they bring, unedited and edited."""
-    brought = reflected_radiance(
-        gatherer.snapshot,
-        gatherer.tracer,
-        gatherer.sampler,
-        hits,
-        through,
-        n_bounces=gatherer.settings.n_bounces,
-        seed=int(hash_combine(seed, 11)),
-    )
-    base = _mean(brought, n_rays)
-    edited = base.copy()
-    rays = np.flatnonzero(np.repeat(touched, n_rays) & through.any(axis=1))
-    if len(rays):
-        some = take_points(hits, rays)
-        caster = gatherer.field.caster_masks(some)
-        color = np.zeros((len(rays), 3), np.float32)
-        if gatherer.incident_color is not None:
-            color = gatherer.incident_color(some)
-        coefficients = gatherer.field.evaluate(color, receiver[:, rays // n_rays], caster)
-        changed = brought.copy()
-        changed[rays] = coefficients.scale * brought[rays] + coefficients.emission * through[rays]
-        which = np.flatnonzero(touched)
-        edited[which] = _mean(changed.reshape(-1, n_rays, 3)[which].reshape(-1, 3), n_rays)
-    return _Light(base, edited)
-
-
-def _mean(values: F32, n_rays: int) -> F32:
-    return values.reshape(-1, n_rays, 3).sum(axis=1, dtype=np.float64).astype(np.float32) / np.float32(n_rays)

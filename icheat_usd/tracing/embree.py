@@ -24,7 +24,7 @@ import ctypes
 import functools
 import weakref
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -112,7 +112,11 @@ class EmbreeTracer:
         embreex is not installed, or Embree ran out of memory.
     """
 
-    def __init__(self, snapshot: SceneSnapshot, *, copied_triangles: int = COPIED_TRIANGLES) -> None:
+    engine: ClassVar[str] = "embree"
+
+    def __init__(
+        self, snapshot: SceneSnapshot, *, copied_triangles: int = COPIED_TRIANGLES, hidden: Bool | None = None
+    ) -> None:
         self._mesh_begin = snapshot.geometry.mesh_begin
         self._instance_mesh = snapshot.geometry.instance_mesh
         self._n_placed = 0
@@ -122,7 +126,7 @@ class EmbreeTracer:
             raise IcheatError(f"Embree could not start (error {library.rtcGetDeviceError(None)}).")
         scenes: list[int] = []
         self._finalizer = weakref.finalize(self, _release, library, self._device, scenes)
-        self._scene = self._build(snapshot.geometry, scenes, copied_triangles)
+        self._scene = self._build(snapshot.geometry, scenes, copied_triangles, hidden)
         if error := library.rtcGetDeviceError(self._device):
             self.close()
             raise IcheatError(
@@ -157,7 +161,7 @@ class EmbreeTracer:
             library.rtcAttachGeometryByID(scene, geometry, geometry_id)
         library.rtcReleaseGeometry(geometry)
 
-    def _build(self, geometry: Geometry, scenes: list[int], copied_triangles: int) -> int:
+    def _build(self, geometry: Geometry, scenes: list[int], copied_triangles: int, hidden: Bool | None) -> int:
         library = _library()
         size = np.diff(geometry.mesh_begin)
         uses = np.bincount(geometry.instance_mesh, minlength=len(size))
@@ -169,7 +173,7 @@ class EmbreeTracer:
         top = self._new_scene(scenes)
         prototypes: dict[int, int] = {}
         for instance, mesh in enumerate(geometry.instance_mesh.tolist()):
-            if size[mesh] == 0:
+            if size[mesh] == 0 or (hidden is not None and hidden[instance]):
                 continue
             corners = geometry.points[geometry.mesh_begin[mesh] : geometry.mesh_begin[mesh + 1]]
             matrix = geometry.instance_to_world[instance]

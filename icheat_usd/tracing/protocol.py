@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,8 @@ from icheat_usd.scene import F32, Bool, Hits, SceneSnapshot, SurfacePoints
 
 class Tracer(Protocol):
     """Pure geometry: any triangle of any instance of the snapshot it was built for, both sides."""
+
+    engine: ClassVar[str]  #: what `build_tracer` knows it by
 
     def intersect(self, origins: F32, directions: F32, t_max: F32 | float | None = None) -> Hits:
         """Nearest hits with ``0 <= t <= t_max``.
@@ -36,13 +38,15 @@ class Tracer(Protocol):
         ...
 
 
-def build_tracer(snapshot: SceneSnapshot, engine: str = "embree") -> Tracer:
+def build_tracer(snapshot: SceneSnapshot, engine: str = "embree", hidden: Bool | None = None) -> Tracer:
     """Tracer for a snapshot.
 
     Parameters
     ----------
     engine : "embree" or "reference"
         The reference compares every ray with every triangle: for tests and small scenes.
+    hidden : (n_instances,) bool, optional
+        Instances that no ray sees; all others keep their numbers.
 
     Raises
     ------
@@ -52,11 +56,11 @@ def build_tracer(snapshot: SceneSnapshot, engine: str = "embree") -> Tracer:
     if engine == "embree":
         from icheat_usd.tracing.embree import EmbreeTracer
 
-        return EmbreeTracer(snapshot)
+        return EmbreeTracer(snapshot, hidden=hidden)
     if engine == "reference":
         from icheat_usd.tracing.reference import ReferenceTracer
 
-        return ReferenceTracer(snapshot)
+        return ReferenceTracer(snapshot, hidden=hidden)
     raise IcheatError(f"Unknown tracing engine {engine!r}; expected 'embree' or 'reference'.")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from icheat_usd.scene import F32, F64, Bool, Hits, SceneSnapshot
@@ -18,12 +20,16 @@ class ReferenceTracer:
     two triangles that share exact corners.
     """
 
-    def __init__(self, snapshot: SceneSnapshot) -> None:
+    engine: ClassVar[str] = "reference"
+
+    def __init__(self, snapshot: SceneSnapshot, *, hidden: Bool | None = None) -> None:
         geometry = snapshot.geometry
         begin = geometry.mesh_begin
         corners: list[F64] = [np.zeros((0, 3, 3))]
         owners, rows = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)]
         for instance, mesh in enumerate(geometry.instance_mesh):
+            if hidden is not None and hidden[instance]:
+                continue
             span = np.arange(begin[mesh], begin[mesh + 1], dtype=np.int32)
             matrix = geometry.instance_to_world[instance].astype(np.float64)
             # Corners are rounded to float32 as the fast tracer's are: then both see the same surface.

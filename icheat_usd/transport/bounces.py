@@ -11,7 +11,7 @@ from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import effective_albedo
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, cell_direct
-from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport.rays import RowBuilder
 from icheat_usd.transport.sparse import SparseRows
@@ -44,6 +44,14 @@ def sum_lights(per_light: F32) -> F32:
     total = np.zeros(per_light.shape[1:], np.float32)
     for values in per_light:
         total += values
+    return total
+
+
+def sum_groups(per_light: F32, group: I64, n_groups: int) -> F32:
+    """Sum (n_lights, n, 3) over the lights of each group, in their order: (n_groups, n, 3)."""
+    total = np.zeros((n_groups, *per_light.shape[1:]), np.float32)
+    for values, into in zip(per_light, group, strict=True):
+        total[into] += values
     return total
 
 

@@ -37,6 +37,8 @@ class Transport:
     lobes: tuple[Lobe, ...]
     row_view: I32  #: (n_rows,) the view sample that each row was computed at
     interpolation: SparseRows | None  #: (n_view x n_rows); None where rows are view samples
+    rays_per_row: int = 256  #: that the rows were measured with
+    seed: int = 0  #: of these rays
 
     def to_view(self, radiance: F32) -> F32:
         """Indirect radiance that view samples send to the eye.
@@ -107,4 +109,4 @@ def build_transport(
         lobes.append(Lobe("specular_base", base, view.points.specular))
         lobes.append(Lobe("specular_edge", edge, view.points.specular_edge))
 
-    return Transport(tuple(lobes), row_view, interpolation)
+    return Transport(tuple(lobes), row_view, interpolation, rays_per_row, seed)

@@ -110,12 +110,12 @@ class RowBuilder:
                 parts.append((rows, base, np.concatenate(second)))
                 second.clear()
 
-        whole = _scatter_rows([(rows, base) for rows, base, _ in parts], len(stream), self._gather.n)
+        whole = scatter_rows([(rows, base) for rows, base, _ in parts], len(stream), self._gather.n)
         if len(parts) == 1:
             edge_weights = parts[0][2]
         else:
             edge_parts = [(rows, replace(base, weights=edge)) for rows, base, edge in parts]
-            edge_weights = _scatter_rows(edge_parts, len(stream), self._gather.n).weights
+            edge_weights = scatter_rows(edge_parts, len(stream), self._gather.n).weights
         return whole, replace(whole, weights=edge_weights)
 
     def _seed_for(self, purpose: int) -> int:
@@ -197,7 +197,7 @@ def _mix(seed: int, value: int) -> int:
     return int(hash_combine(seed & 0xFFFFFFFF, value))
 
 
-def _scatter_rows(parts: list[tuple[I64, SparseRows]], n_rows: int, n_columns: int) -> SparseRows:
+def scatter_rows(parts: list[tuple[I64, SparseRows]], n_rows: int, n_columns: int) -> SparseRows:
     """One matrix of parts whose rows belong at given places, ascending in each part; other rows are empty."""
     counts = np.zeros(n_rows, np.int64)
     for place, rows in parts:

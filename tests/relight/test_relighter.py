@@ -94,11 +94,11 @@ def slow(pipeline: Pipeline, field: EditField) -> np.ndarray:
     return reference.edited_radiance(
         field,
         matrix,
-        pipeline.relighter.radiance(),
+        pipeline.cell_light.radiance if field.n_groups > 1 else pipeline.relighter.radiance()[None],
         gather.area,
         view.points.albedo,
-        field.receiver_masks(view.points),
-        field.caster_masks(gather.points),
+        field.receivers(view.points),
+        field.casters(gather.points),
     )
 
 

@@ -1,0 +1,130 @@
+"""All light of receivers under a stack, summed over their pairs: what relighter and final gather have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from icheat_usd.edits.field import Aggregate, EditField, Ends, StackCoefficients, weighted
+from icheat_usd.edits.offsets import OffsetCasters, offset_radiance
+from icheat_usd.scene import F32, I64
+
+#: Pairs evaluated at once; bounds memory and keeps the arrays of a step near the caches.
+PAIRS_AT_ONCE = 1 << 19
+
+
+class PairLight(NamedTuple):
+    """Light that n pairs bring to their receivers before any edit."""
+
+    owner: I64  #: (n,) position of the receiver among those that are evaluated together
+    casters: Ends  #: of the n pairs
+    seen: F32  #: (G, n, 3) radiance that leaves the casters, as the edits look at it
+    brought: F32  #: (G, n, 3) radiance that arrives: transport times what leaves
+    emitted: F32  #: (n, 3) transport, on which added emission travels
+    through: int | None = None  #: slot of `EditField.throughs` whose occluders hold this light back
+
+
+def arriving(
+    field: EditField,
+    coefficients: StackCoefficients,
+    brought: F32,
+    emitted: F32 | np.float32,
+    casters: Ends,
+    through: int | None = None,
+    aggregate: Aggregate | None = None,
+) -> F32 | None:
+    """Light of pairs under the stack, (n, 3); of an aggregate's casters and lights alone where one is given.
+
+    None where it is 0 throughout.
+    """
+    if through is not None:
+        factor = coefficients.through[through]
+        if factor is None:
+            return None
+        share = brought if aggregate is None else field.aggregate_share(aggregate, casters) * brought
+        return weighted(factor, share)
+    if aggregate is None:
+        return weighted(coefficients.scale, brought) + coefficients.emission * emitted
+    light = weighted(coefficients.scale, field.aggregate_share(aggregate, casters) * brought)
+    if field.edits[aggregate.edit].groups.all():
+        light += casters.masks[aggregate.row][:, None] * (coefficients.emission * emitted)
+    return light
+
+
+def edited_light(
+    field: EditField,
+    receivers: Ends,
+    blocks: Sequence[PairLight],
+    offsets: OffsetCasters | None = None,
+    albedo: F32 | None = None,
+) -> F32:
+    """Indirect light of m receivers under the stack, before `EditField.finish`.
+
+    Parameters
+    ----------
+    receivers : Ends of the m receivers
+    blocks : sequence of PairLight
+        Together all of the receivers' pairs.
+    offsets : OffsetCasters, optional
+        What adds offsets, where the stack has any.
+    albedo : (m, 3) float32, optional
+        Diffuse albedo of the receivers, for `offsets`.
+
+    Returns
+    -------
+    (m, 3) float32
+    """
+    n = receivers.masks.shape[1]
+
+    def total(resolved: Sequence[F32], upto: int | None = None, aggregate: Aggregate | None = None) -> F32:
+        light = np.zeros((n, 3))
+        for block in blocks:
+            for part in _parts(block):
+                here = [np.take(scale, part.owner, axis=0) for scale in resolved]
+                coefficients = field.evaluate(part.seen, receivers.take(part.owner), part.casters, here, upto)
+                brought = arriving(
+                    field, coefficients, part.brought, part.emitted, part.casters, part.through, aggregate
+                )
+                if brought is not None:
+                    light += _sum_by(part.owner, brought, n)
+        result: F32 = light.astype(np.float32)
+        if offsets is not None and albedo is not None:
+            result += offset_radiance(field, offsets, receivers, albedo, resolved, upto, aggregate)
+        return result
+
+    resolved: list[F32] = []
+    added = np.zeros((n, 3), np.float32)
+    for aggregate in field.aggregates:
+        weight = field.aggregate_weight(aggregate, receivers)
+        if not weight.any():
+            resolved.append(np.ones((n, 3), np.float32))
+            continue
+        # Keys of one edit see the same weaker stack.
+        scale, rest = field.resolve(aggregate, total(resolved, aggregate.edit, aggregate))
+        resolved.append(scale)
+        added += weight * rest
+    return total(resolved) + added
+
+
+def _parts(block: PairLight) -> Iterator[PairLight]:
+    n = len(block.owner)
+    if n <= PAIRS_AT_ONCE:
+        yield block
+        return
+    for begin in range(0, n, PAIRS_AT_ONCE):
+        some = np.arange(begin, min(begin + PAIRS_AT_ONCE, n))
+        yield PairLight(
+            block.owner[some],
+            block.casters.take(some),
+            block.seen[:, some],
+            block.brought[:, some],
+            block.emitted[some],
+            block.through,
+        )
+
+
+def _sum_by(owner: I64, values: F32, n: int) -> F32:
+    """Sum (m, 3) values by owner, (n, 3); serial and in float64."""
+    return np.stack([np.bincount(owner, values[:, channel], n) for channel in range(3)], axis=1)
