@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from icheat_usd.edits.model import SurfaceMask
+from icheat_usd.edits.model import MaskedSurface, SurfaceMask
+from icheat_usd.edits.painting import mesh_texel_positions
 from icheat_usd.errors import EditError
-from icheat_usd.scene import F32, I32, I64, SceneSnapshot
+from icheat_usd.kernels import nearest as kernels
+from icheat_usd.scene import F32, F64, I32, I64, Finding, SceneSnapshot, Surface
+
+#: Texel spacings by which a texel that faces the other way is further off (twice over).
+_DETOUR = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,6 +23,7 @@ class BoundMask:
 
     texels: F32  #: (n_faces, resolution, resolution)
     first_face: I64  #: (n_instances,) first row of the instance's faces in `texels`, -1 where it has none
+    findings: tuple[Finding, ...] = ()  #: surfaces that the weights were carried over to
 
     def at(self, instance: I32, face: I32, face_uv: F32) -> F32:
         """Weights (n,) in [0, 1] at places on control faces; 0 on surfaces that were not painted.
@@ -45,31 +52,42 @@ def bind_mask(mask: SurfaceMask, snapshot: SceneSnapshot, where: str) -> BoundMa
     Raises
     ------
     EditError
-        A surface has another topology than when it was painted, or none of them is in the scene.
+        None of the surfaces is in the scene, or one has another topology than when it was painted and the mask does
+        not tell where its faces lay.
     """
     begins = np.concatenate([[0], np.cumsum([surface.n_faces for surface in mask.surfaces])])
     rows = {(s.path, s.instance_id, s.part): (s, int(begins[i])) for i, s in enumerate(mask.surfaces)}
     first = np.full(len(snapshot.surfaces), -1, np.int64)
-    found = 0
+    texels, n_texels = [mask.texels], len(mask.texels)
+    findings = []
     for i, surface in enumerate(snapshot.surfaces):
-        entry = rows.get((surface.path, surface.instance_id, surface.part))
-        if entry is None:
+        masked, begin = rows.get((surface.path, surface.instance_id, surface.part), (None, -1))
+        if masked is None or _same_topology(masked, surface):
+            first[i] = begin
             continue
-        masked, begin = entry
-        if masked.topology_digest and masked.topology_digest != surface.topology_digest:
-            raise EditError(
-                f"{where}: its painted mask was made for another topology of {surface.path}"
-                f" ({masked.n_faces} faces then, {surface.n_faces} now); paint it again or mute the edit"
-            )
-        first[i] = begin
-        found += 1
-    if not found:
+        some = slice(begin, begin + masked.n_faces)
+        change = (
+            f"its painted mask was made for another topology of {surface.path}"
+            f" ({masked.n_faces} faces then, {surface.n_faces} now)"
+        )
+        if mask.rest is None:
+            raise EditError(f"{where}: {change}; paint it again or mute the edit")
+        texels.append(_carried_over(mask.texels[some], mask.rest[some], snapshot, i))
+        first[i], n_texels = n_texels, n_texels + surface.n_faces
+        findings.append(Finding(where, "painted mask", f"{change}; carried over by nearest surface, paint it again"))
+    if (first < 0).all():
         raise EditError(
             f"{where}: its payload was made for another scene: none of its {len(mask.surfaces)} painted surfaces"
             f" (such as {mask.surfaces[0].path if mask.surfaces else '-'}) is in this one;"
             " point icheat:filePath at the right sidecar, or set rel icheat:anchor"
         )
-    return BoundMask(mask.texels, first[snapshot.geometry.instance_surface])
+    return BoundMask(np.concatenate(texels), first[snapshot.geometry.instance_surface], tuple(findings))
+
+
+def _same_topology(masked: MaskedSurface, surface: Surface) -> bool:
+    """Deformed meshes are the same; a mask that does not know the topology has but the number of faces to go by."""
+    digest = masked.topology_digest or surface.topology_digest
+    return digest == surface.topology_digest and masked.n_faces == surface.n_faces
 
 
 def _bilinear(texels: F32, rows: I64, uv: F32) -> F32:
@@ -82,3 +100,60 @@ def _bilinear(texels: F32, rows: I64, uv: F32) -> F32:
     top = texels[rows, y0, x0] * (1 - f[:, 0]) + texels[rows, y0, x1] * f[:, 0]
     bottom = texels[rows, y1, x0] * (1 - f[:, 0]) + texels[rows, y1, x1] * f[:, 0]
     return (top * (1 - f[:, 1]) + bottom * f[:, 1]).astype(np.float32)
+
+
+# --------------------------------------------------------------------------- another topology
+
+
+def _carried_over(texels: F32, rest: F32, snapshot: SceneSnapshot, row: int) -> F32:
+    """Weights of the nearest old texel for each texel of surface `row`: (its n_faces, resolution, resolution).
+
+    "Nearest" counts a texel that faces away as further off, so that a thin
+    wall does not take what was painted on its other side.
+    """
+    geometry, surface = snapshot.geometry, snapshot.surfaces[row]
+    resolution = texels.shape[1]
+    instances = np.flatnonzero(geometry.instance_surface == row)
+    if not len(instances) or not len(texels):
+        return np.zeros((surface.n_faces, resolution, resolution), np.float32)
+    now = mesh_texel_positions(snapshot, int(geometry.instance_mesh[instances[0]]), surface.n_faces, resolution)
+    then = _spread(rest.astype(np.float64), resolution)
+    found = _nearest(then.reshape(-1, 3), _normals(then), now.reshape(-1, 3).astype(np.float64), _normals(now))
+    return np.asarray(texels.reshape(-1)[found].reshape(now.shape[:3]))
+
+
+def _spread(rest: F64, resolution: int) -> F64:
+    """Texel centres of any resolution from those of resolution 2: exact on bilinear faces."""
+    t = ((np.arange(resolution) + 0.5) / resolution - 0.25) / 0.5
+    share = np.stack([1 - t, t], axis=1)
+    return np.asarray(np.einsum("yj,xi,fjic->fyxc", share, share, rest))
+
+
+def _normals(places: NDArray[np.floating]) -> F64:
+    """One unit normal per texel, the same all over a face; 0 where the face has no area."""
+    n_faces, resolution = places.shape[:2]
+    if resolution < 2:
+        return np.zeros((n_faces, 3))
+    across = (places[:, :, -1] - places[:, :, 0]).sum(axis=1, dtype=np.float64)
+    up = (places[:, -1] - places[:, 0]).sum(axis=1, dtype=np.float64)
+    normals = np.cross(across, up)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return np.repeat(normals, resolution * resolution, axis=0)
+
+
+def _nearest(places: F64, normals: F64, queries: F64, query_normals: F64) -> I64:
+    low, high = places.min(axis=0), places.max(axis=0)
+    extent = float((high - low).max())
+    # As many cells as places, were these spread all over: on a surface some dozen share a cell.
+    size = max(extent / max(np.cbrt(len(places)), 1.0), 1e-30)
+    dims = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
+    begin = np.zeros(int(dims.prod()) + 1, np.int64)
+    cell, order = np.empty(len(places), np.int64), np.empty(len(places), np.int64)
+    kernels.sort_into_cells(places, low, size, dims, cell, begin, order)
+    spacing = extent / np.sqrt(len(places))
+    found = np.empty(len(queries), np.int64)
+    kernels.nearest_place(
+        places, normals, low, size, dims, begin, order, (_DETOUR * spacing) ** 2, queries, query_normals, found
+    )
+    return found

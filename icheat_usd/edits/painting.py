@@ -45,28 +45,38 @@ def paint_mask(snapshot: SceneSnapshot, paths: Iterable[str], brush: Brush, *, r
         None of the paths is a surface of the scene.
     """
     wanted = frozenset(paths)
-    surfaces, texels = [], []
+    surfaces, texels, rest = [], [], []
     geometry = snapshot.geometry
     for row, surface in enumerate(snapshot.surfaces):
         if surface.path not in wanted:
             continue
-        instances = np.flatnonzero(geometry.instance_surface == row)
         positions = np.zeros((surface.n_faces, resolution, resolution, 3), np.float32)
-        for instance in instances[:1]:
-            mesh = geometry.instance_mesh[instance]
-            some = slice(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
-            face = geometry.face[some]
-            order = np.argsort(face, kind="stable")
-            begins = np.searchsorted(face[order], np.arange(surface.n_faces + 1)).astype(np.int64)
+        at_rest = np.zeros((surface.n_faces, 2, 2, 3), np.float32)
+        for instance in np.flatnonzero(geometry.instance_surface == row)[:1]:
+            mesh = int(geometry.instance_mesh[instance])
+            positions = mesh_texel_positions(snapshot, mesh, surface.n_faces, resolution)
+            at_rest = mesh_texel_positions(snapshot, mesh, surface.n_faces, 2)
             matrix = geometry.instance_to_world[instance]
-            world = (geometry.points[some][order] @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
-            uv = np.ascontiguousarray(geometry.face_uv[some][order])
-            texel_positions(begins, np.ascontiguousarray(world), uv, resolution, positions)
+            positions = (positions @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
         weights = np.clip(brush(positions.reshape(-1, 3)), 0, 1)
         texels.append((np.round(weights * 255) / np.float32(255)).astype(np.float32).reshape(positions.shape[:3]))
+        rest.append(at_rest)
         surfaces.append(
             MaskedSurface(surface.path, surface.n_faces, surface.instance_id, surface.part, surface.topology_digest)
         )
     if not surfaces:
         raise EditError(f"nothing to paint: none of {sorted(wanted)} is a surface of {snapshot.stage_path}")
-    return SurfaceMask(tuple(surfaces), np.concatenate(texels))
+    return SurfaceMask(tuple(surfaces), np.concatenate(texels), np.concatenate(rest))
+
+
+def mesh_texel_positions(snapshot: SceneSnapshot, mesh: int, n_faces: int, resolution: int) -> F32:
+    """Texel centres on the control faces of one mesh, (n_faces, resolution, resolution, 3) in object space."""
+    geometry = snapshot.geometry
+    some = slice(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
+    face = geometry.face[some]
+    order = np.argsort(face, kind="stable")
+    begins = np.searchsorted(face[order], np.arange(n_faces + 1)).astype(np.int64)
+    points, uv = (np.ascontiguousarray(values[some][order]) for values in (geometry.points, geometry.face_uv))
+    positions = np.zeros((n_faces, resolution, resolution, 3), np.float32)
+    texel_positions(begins, points, uv, resolution, positions)
+    return positions

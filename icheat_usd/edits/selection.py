@@ -20,7 +20,7 @@ from icheat_usd.edits.model import (
     SurfacesAt,
     SurfacesOf,
 )
-from icheat_usd.scene import F32, I32, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, Finding, SceneSnapshot, SurfacePoints
 
 #: A surface that lies on the border of a region is inside, whichever way its points were rounded.
 _BORDER = np.float32(1 + 1e-5)
@@ -38,6 +38,11 @@ class BoundSelection:
     def constant_on_instances(self) -> bool:
         """True if `on_instances` is all there is: the weight of a point depends on its instance alone."""
         return not self.within and self.mask is None
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the painted mask had to make do with."""
+        return () if self.mask is None else self.mask.findings
 
     def at(self, points: SurfacePoints) -> F32:
         """Weights of the points, (n,) in [0, 1]; 0 where a point is no hit."""
