@@ -1,4 +1,4 @@
-"""Where the USD plug-in with the schemas lies, for hosts that must know before USD starts.
+"""Where the USD plug-ins with schemas and validators lie, for hosts that must know before USD starts.
 
     export PXR_PLUGINPATH_NAME="$(python -m icheat_usd.plugin_path)${PXR_PLUGINPATH_NAME:+:$PXR_PLUGINPATH_NAME}"
 
@@ -7,6 +7,7 @@ Imports no USD, so that it can run before a host does.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from icheat_usd.resources import resource_path
@@ -23,9 +24,25 @@ def plugin_directory() -> Path:
     return resource_path("schemas/usd")
 
 
+def plugin_directories() -> tuple[Path, ...]:
+    """All plug-ins: that with the schemas, and that with the validators. USD takes one plug-in of a directory.
+
+    Raises
+    ------
+    IcheatError
+        The installation lacks them.
+    """
+    return plugin_directory(), resource_path("schemas/validation")
+
+
+def search_path() -> str:
+    """All plug-ins, as PXR_PLUGINPATH_NAME takes them."""
+    return os.pathsep.join(str(directory) for directory in plugin_directories())
+
+
 def main() -> int:
-    """Print the directory."""
-    print(plugin_directory())
+    """Print the directories."""
+    print(search_path())
     return 0
 
 

@@ -59,6 +59,7 @@ def test_an_installed_wheel_finds_its_own_data(packages: Path, tmp_path: Path) -
     elsewhere.mkdir()
     icheat = ["-m", "icheat_usd"]
     path = run([*icheat, "plugin-path"], elsewhere, PYTHONPATH=str(site)).strip()
-    assert Path(path) == site / "icheat_usd" / "schemas" / "usd"
+    schemas = site / "icheat_usd" / "schemas"
+    assert path.split(os.pathsep) == [str(schemas / "usd"), str(schemas / "validation")]
     stage = site / "icheat_usd" / "sample_stages" / "cornell_box" / "shot.usda"
     assert run([*icheat, "check", str(stage)], elsewhere, PYTHONPATH=str(site), PXR_PLUGINPATH_NAME="") == ""

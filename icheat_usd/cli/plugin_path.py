@@ -1,4 +1,4 @@
-"""Print the folder of the USD plug-in with the schemas, for PXR_PLUGINPATH_NAME.
+"""Print the folders of the USD plug-ins with schemas and validators, for PXR_PLUGINPATH_NAME.
 
 export PXR_PLUGINPATH_NAME="$(icheat plugin-path)${PXR_PLUGINPATH_NAME:+:$PXR_PLUGINPATH_NAME}"
 """
@@ -15,11 +15,10 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
 
 
 def command(options: argparse.Namespace) -> int:
-    from icheat_usd.plugin_path import plugin_directory
+    from icheat_usd.plugin_path import plugin_directories, search_path
 
-    path = str(plugin_directory())
     if options.json:
-        print_json({"path": path})
+        print_json({"path": search_path(), "folders": [str(folder) for folder in plugin_directories()]})
     else:
-        print(path)
+        print(search_path())
     return 0

@@ -5,14 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
+from icheat_usd.edits.facts import facts
+from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask
 from icheat_usd.errors import SidecarError
-from icheat_usd.stage import schema
+from icheat_usd.resources import resource_path
+from icheat_usd.stage import schema, take_snapshot
 from icheat_usd.stage.authoring import add_edit, create_stack, remove_edit, set_payload_key
 from icheat_usd.stage.check import RULES, check_stage
+from icheat_usd.stage.meshes import topology_digest
 from icheat_usd.stage.stacks import Severity
 from tests.stage.edit_stages import DIGEST, OTHER, RecordingReader, layer, python, shot_stage
 
@@ -173,9 +179,77 @@ def outdated_copy(stage: Usd.Stage) -> None:
     layer(stage, "seq.usda").SetTimeSample(f"{WARM}.{schema.PAYLOAD}", 1, OTHER)
 
 
+def selection(stage: Usd.Stage, name: str, *parts: str) -> str:
+    prim = stage.DefinePrim(f"/World/indirect/{name}", "Scope")
+    prim.ApplyAPI(schema.SELECTION_API)
+    prim.CreateRelationship(schema.PARTS, False).SetTargets(list(parts))
+    return str(prim.GetPath())
+
+
+def limited_by(stage: Usd.Stage, path: str) -> None:
+    warm(stage).CreateRelationship(schema.RECEIVER_LIMITS, False).SetTargets([path])
+
+
+def selections_in_a_circle(stage: Usd.Stage) -> None:
+    limited_by(stage, selection(stage, "a", "/World/indirect/b"))
+    selection(stage, "b", "/World/floor", "/World/indirect/a")
+
+
+def limit_missing(stage: Usd.Stage) -> None:
+    limited_by(stage, "/World/nowhere")
+
+
+def part_missing(stage: Usd.Stage) -> None:
+    limited_by(stage, selection(stage, "a", "/World/nothing"))
+
+
+def unknown_selection_rule(stage: Usd.Stage) -> None:
+    path = selection(stage, "a", "/World/floor")
+    stage.GetPrimAtPath(path).GetAttribute(schema.RULE).Set("minus")
+
+
+def rendered_region(stage: Usd.Stage) -> None:
+    stage.DefinePrim("/World/indirect/ball", "Sphere")
+    limited_by(stage, "/World/indirect/ball")
+
+
+def flat_region(stage: Usd.Stage) -> None:
+    ball = UsdGeom.Sphere.Define(stage, "/World/indirect/ball")
+    ball.CreatePurposeAttr("guide")
+    ball.CreateRadiusAttr(0.0)
+    limited_by(stage, "/World/indirect/ball")
+
+
+def unshadow_alone(stage: Usd.Stage) -> None:
+    prim = stage.GetPrimAtPath("/World/indirect/cool")
+    prim.GetAttribute(schema.OPERATION).Set("unshadow")
+
+
+def two_targets(stage: Usd.Stage) -> None:
+    warm(stage).CreateRelationship(schema.TARGET, False).SetTargets(["/World/floor", "/World/Room"])
+
+
+def light_is_a_camera(stage: Usd.Stage) -> None:
+    warm(stage).CreateRelationship(schema.LIGHTS, False).SetTargets(["/World/camera"])
+
+
+def baked_without_payload(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/World/indirect/cool").GetAttribute(schema.OPERATION).Set("baked")
+
+
 @pytest.mark.parametrize(
     ("break_it", "rule", "message"),
     [
+        (selections_in_a_circle, "SelectionInCircle", "leads in a circle"),
+        (limit_missing, "SelectedPrimMissing", "/World/nowhere does not exist"),
+        (part_missing, "SelectedPrimMissing", "/World/nothing does not exist"),
+        (unknown_selection_rule, "UnknownToken", "'minus' is not one of intersection, union, difference"),
+        (rendered_region, "RegionIsRendered", "set its purpose to guide"),
+        (flat_region, "RegionWithoutSpace", "selects no space"),
+        (unshadow_alone, "UnshadowWithoutOccluders", "has none; name some"),
+        (two_targets, "SeveralTargets", "has 2 targets"),
+        (light_is_a_camera, "LightIsNoLight", "/World/camera is no light"),
+        (baked_without_payload, "BakedWithoutPayload", "there is no payload"),
         (on_a_mesh, "SchemaOnWrongType", "prim of Mesh, expected Scope"),
         (mistyped_name, "UnknownAttribute", "did you mean icheat:amount"),
         (mistyped_collection, "UnknownAttribute", "no schema declares"),
@@ -187,7 +261,7 @@ def outdated_copy(stage: Usd.Stage) -> None:
         (listed_twice_in_a_layer, "EditListedTwice", "listed twice in .*shot.usda"),
         (unlisted, "EditInNoStack", "no stack lists it"),
         (camera_is_a_mesh, "CameraIsNoCamera", "/World/floor is no camera"),
-        (unknown_operation, "UnknownOperation", "'studioThing' is unknown.*hsv, scale"),
+        (unknown_operation, "UnknownOperation", "'studioThing' is unknown.*hsv.*scale"),
         (operation_without_schema, "OperationSchemaNotApplied", "without IcheatHsvAPI"),
         (unknown_blend, "UnknownToken", "'multiply' is not one of compose, over, add"),
         (not_finite_at_one_time, "NotFinite", "inf in .*shot.usda at time 50"),
@@ -236,6 +310,127 @@ def test_a_reader_that_refuses_a_payload_is_quoted(stage: Usd.Stage) -> None:
 
     found = [f.message for f in check_stage(stage, read_payload=refuse)]  # type: ignore[arg-type]
     assert len(found) == 2 and all("is damaged" in message for message in found)
+
+
+def payloads(**given: Payload) -> Callable[..., Payload]:
+    """A reader that knows the payload of frame 1 and that of frame 11."""
+
+    def read(file: str, source: str | bytes, digest: str, anchor: str) -> Payload:
+        return given["first" if digest == DIGEST else "second"]
+
+    return read
+
+
+PLAIN = Payload("scale", {})
+
+
+def found(stage: Usd.Stage, **given: Payload) -> list[tuple[str, str]]:
+    reader = payloads(**({"first": PLAIN, "second": PLAIN} | given))
+    return [(f.rule, f.message) for f in check_stage(stage, read_payload=reader)]
+
+
+def test_a_baked_edit_needs_a_baked_form(stage: Usd.Stage) -> None:
+    warm(stage).GetAttribute(schema.OPERATION).Set("baked")
+    good = Payload("scale", {}, scale_delta=(1.0, 0.0, 0.0))
+    ((rule, message),) = found(stage, first=good)
+    assert rule == "BakedWithoutPayload" and OTHER[:12] in message
+    assert found(stage, first=good, second=good) == []
+
+
+def test_parameters_that_moved_on_make_constants_stale(stage: Usd.Stage) -> None:
+    half = Payload("scale", {"gain": 0.5}, scale_delta=(-0.5, -0.5, -0.5))
+    assert found(stage, first=half) == []
+    warm(stage).GetAttribute("icheat:scale:color").Set((0.5, 0.5, 0.5))
+    warm(stage).GetAttribute("icheat:scale:gain").Set(1.0)
+    assert found(stage, first=half) == []  # the same factor, said otherwise
+    warm(stage).GetAttribute("icheat:scale:gain").Set(1.6)
+    ((rule, message),) = found(stage, first=half)
+    assert rule == "BakedParametersChanged" and "at 1 is stale: color is" in message and "gain is 1.6" in message
+    warm(stage).GetAttribute(schema.OPERATION).Set("hsv")
+    rules = dict(found(stage, first=half))
+    assert "the operation is 'hsv', and was 'scale'" in rules["BakedParametersChanged"]
+
+
+def test_a_repainted_topology_and_a_lost_surface_are_found(stage: Usd.Stage) -> None:
+    mesh = UsdGeom.Mesh.Get(stage, "/World/floor")
+    now = topology_digest(np.array([3]), np.array([0, 1, 2]))
+    surfaces = (MaskedSurface("/World/floor", 1, topology_digest=now), MaskedSurface("/World/camera", 1))
+    painted = Payload("scale", {}, receiver_mask=SurfaceMask(surfaces, np.ones((2, 1, 1), np.float32)))
+    assert found(stage, first=painted) == []
+    mesh.GetFaceVertexIndicesAttr().Set([0, 2, 1])
+    stage.GetPrimAtPath("/World/camera").SetActive(False)
+    messages = [message for rule, message in found(stage, first=painted) if rule == "PaintedSurfaceChanged"]
+    assert [m.partition(";")[0] for m in messages] == [
+        "painted surface /World/floor has other faces",
+        "painted surface /World/camera is gone",
+    ]
+
+
+def test_rows_are_stale_once_the_scene_has_changed_and_say_what(stage: Usd.Stage) -> None:
+    UsdLux.SphereLight.Define(stage, "/World/key").CreateIntensityAttr(2.0)
+    made = facts(take_snapshot(stage, camera="auto", time=1.0), "/World")
+    for prim in (warm(stage),):
+        prim.GetRelationship(schema.ANCHOR).SetTargets(["/World"])
+    rows: Any = object()
+    plain, non_linear = (Payload(name, {}, rows=rows, made_against=made) for name in ("scale", "gamma"))
+    warm(stage).GetAttribute(schema.OPERATION).Set("baked")
+    assert found(stage, first=plain, second=non_linear) == []
+
+    stage.GetPrimAtPath("/World/key").GetAttribute("inputs:intensity").Set(3.0)
+    ((rule, message),) = found(stage, first=plain, second=non_linear)
+    assert (rule, message) == (
+        "BakedStale",
+        "what is baked at 11 is stale: light key got brighter (1.5 times); bake it again",
+    )
+    UsdGeom.Xformable(stage.GetPrimAtPath("/World/floor")).AddTranslateOp().Set((0, 0, 1.0))
+    first, second = (message for _, message in found(stage, first=plain, second=non_linear))
+    assert first == "what is baked at 1 is stale: surface floor moved; bake it again"
+    assert "surface floor moved; light key got brighter" in second
+
+
+def test_rows_stay_fresh_under_another_name(stage: Usd.Stage) -> None:
+    made = facts(take_snapshot(stage, camera="auto", time=1.0), "/World")
+    warm(stage).GetRelationship(schema.ANCHOR).SetTargets(["/World"])
+    rows: Any = object()
+    payload = Payload("gamma", {}, rows=rows, made_against=made)
+    warm(stage).GetAttribute(schema.OPERATION).Set("baked")
+    outer = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(outer, 1.0)
+    outer.SetDefaultPrim(outer.DefinePrim("/Show"))
+    outer.DefinePrim("/Show/set").GetReferences().AddReference(stage.GetRootLayer().identifier)
+    assert [rule for rule, _ in found(outer, first=payload, second=payload)] == []
+    outer.OverridePrim("/Show/set/floor").GetAttribute("points").Set([(0, 0, 0), (2, 0, 0), (0, 1, 0)])
+    assert {rule for rule, _ in found(outer, first=payload, second=payload)} == {"BakedStale"}
+
+
+def test_hosts_find_the_rules_as_validators(stage: Usd.Stage, tmp_path: Path) -> None:
+    if Usd.GetVersion() < (0, 26, 5):
+        pytest.skip("this USD takes no validators from Python")
+    rendered_region(stage)
+    two_targets(stage)
+    for name in ("seq.usda", "shot.usda"):
+        layer(stage, name).Save()
+    code = (
+        "import sys\nfrom pxr import Usd, UsdValidation as V\n"
+        "stage = Usd.Stage.Open(sys.argv[1])\n"
+        "context = V.ValidationContext(keywords=['icheat'], includeAllAncestors=False)\n"
+        "for e in context.Validate(stage):\n"
+        "    print(e.GetName(), e.GetType().name, *((s.GetProperty() or s.GetPrim()).GetPath() for s in e.GetSites()))\n"
+    )
+    from icheat_usd.plugin_path import search_path
+
+    told = python(code, str(tmp_path / "shot.usda"), environment={"PXR_PLUGINPATH_NAME": search_path()})
+    ours = sorted(line for line in told.splitlines() if "Missing" not in line)
+    assert ours == [
+        "RegionIsRendered Warn /World/indirect/ball.purpose",
+        f"SeveralTargets Error {WARM}.{schema.TARGET}",
+    ]
+
+
+def test_the_plug_in_announces_every_rule() -> None:
+    from icheat_usd.session.validators import PLUGIN, plugin_text
+
+    assert resource_path(PLUGIN).read_text() == plugin_text(), "run python -m icheat_usd.session.validators"
 
 
 def test_every_rule_says_what_it_wants() -> None:
