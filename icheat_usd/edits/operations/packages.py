@@ -46,7 +46,7 @@ def load(name: str) -> Operation | None:
             f"operation '{name}' of {_package(entry)} cannot be loaded from {entry.value}"
             f" ({type(error).__name__}: {error}); update or uninstall that package"
         ) from error
-    if not isinstance(operation, Operation) or operation.name != name:
+    if not isinstance(operation, Operation) or getattr(operation, "name", None) != name:
         raise EditError(
             f"{_package(entry)} declares {entry.value} as operation '{name}', expected a subclass of"
             f" icheat_usd.edits.operations.Operation of that name, found {operation!r}; update that package"
