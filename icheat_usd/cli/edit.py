@@ -101,6 +101,20 @@ def _add_values(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--exclude-{side}", nargs="+", metavar="PRIM", default=[], help="prims below those to leave out"
         )
+        parser.add_argument(
+            f"--{side}-expression",
+            metavar="EXPR",
+            help=f"membership expression in place of --{side}, such as '//{{isa:Mesh}} - //Props//*'",
+        )
+        parser.add_argument(
+            f"--{side[:-1]}-limit",
+            nargs="*",
+            metavar="PRIM",
+            help=f"only {side} that are in all of these: materials, regions, selections, collections, prims",
+        )
+    parser.add_argument("--light", nargs="*", metavar="PRIM", help="only light that first left these; default all")
+    parser.add_argument("--occluder", nargs="*", metavar="PRIM", help="prims that the operation lets light pass")
+    parser.add_argument("--target", metavar="PRIM", help="prim that the operation aims at; '' for none")
 
 
 def _add_place(parser: argparse.ArgumentParser) -> None:
@@ -126,10 +140,9 @@ def add_command(options: argparse.Namespace) -> int:
     from icheat_usd.stage.authoring import Members
 
     stage, layer = open_for_writing(options)
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {name: value for name, value in _related(options).items() if value is not None}
     for side in ("receivers", "casters"):
-        included, excluded = getattr(options, side) or [], getattr(options, f"exclude_{side}")
-        values[side] = Members(tuple(included), tuple(excluded))
+        values[side] = _members(options, side) or Members()
     for name in ("operation", "amount", "blend"):
         if getattr(options, name) is not None:
             values[name] = getattr(options, name)
@@ -155,6 +168,27 @@ def add_command(options: argparse.Namespace) -> int:
     return 0
 
 
+def _members(options: argparse.Namespace, side: str) -> Any:
+    """What the options select on one side, None where they say nothing."""
+    from icheat_usd.stage.authoring import Members
+
+    included, excluded = getattr(options, side), getattr(options, f"exclude_{side}")
+    expression = getattr(options, f"{side}_expression")
+    if not (included or excluded or expression):
+        return None
+    return Members(tuple(included or ()), tuple(excluded), expression or "")
+
+
+def _related(options: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "receiver_limits": options.receiver_limit,
+        "caster_limits": options.caster_limit,
+        "lights": options.light,
+        "occluders": options.occluder,
+        "target": options.target,
+    }
+
+
 def _brush(session: Any, numbers: tuple[float, ...]) -> Any:
     from icheat_usd.session import soft_sphere
 
@@ -165,15 +199,14 @@ def _brush(session: Any, numbers: tuple[float, ...]) -> Any:
 def set_command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.authoring import named_edit, open_for_writing
     from icheat_usd.session import authoring
-    from icheat_usd.stage.authoring import Members
 
     stage, layer = open_for_writing(options)
     _, edit = named_edit(stage, options)
     values: dict[str, Any] = {"operation": options.operation, "amount": options.amount, "blend": options.blend}
     values |= {"parameters": dict(options.set) if options.set else None, "time": options.frame}
+    values |= _related(options)
     for side in ("receivers", "casters"):
-        included, excluded = getattr(options, side), getattr(options, f"exclude_{side}")
-        values[side] = Members(tuple(included or ()), tuple(excluded)) if included or excluded else None
+        values[side] = _members(options, side)
     return _report(options, edit, layer, authoring.set_edit(stage, edit, layer=layer, **values))
 
 

@@ -19,6 +19,8 @@ VERBS = (
     "render",
     "stack",
     "edit",
+    "region",
+    "selection",
     "tree",
     "cat",
     "check",

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from icheat_usd.edits import operations
-from icheat_usd.edits.model import Blend, Payload, SurfaceMask, Value
+from icheat_usd.edits.model import Blend, Payload, Rule, SurfaceMask, Value
 from icheat_usd.edits.operations.constants import BakedConstants, baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.scene import Finding
 from icheat_usd.session.origin import history_entry
 from icheat_usd.sidecar import read_payload as read_sidecar
 from icheat_usd.sidecar import write_payloads
-from icheat_usd.stage import authoring
+from icheat_usd.stage import authoring, collections
 from icheat_usd.stage.authoring import Members
 
 
@@ -58,6 +58,11 @@ def add_edit(
     parameters: Mapping[str, Value] | None = None,
     receivers: Members | Sequence[str] = (),
     casters: Members | Sequence[str] = (),
+    receiver_limits: Sequence[str] = (),
+    caster_limits: Sequence[str] = (),
+    occluders: Sequence[str] = (),
+    lights: Sequence[str] = (),
+    target: str | None = None,
     amount: float = 1.0,
     blend: Blend | str = Blend.COMPOSE,
     receiver_mask: SurfaceMask | None = None,
@@ -75,6 +80,8 @@ def add_edit(
     ----------
     stack : str or None
         None makes one, ``<default prim>/Edits``.
+    receivers, casters, receiver_limits, caster_limits, occluders, lights, target
+        What the edit is about; see `stage.authoring.add_edit`.
     sidecar : path, optional
         Folder or file for the payload; beside the layer's file by default. Needed for layers without a file.
     why : str
@@ -87,7 +94,7 @@ def add_edit(
         as before, and no sidecar is left behind.
     """
     parameters = parameters or {}
-    target = authoring.find_layer(stage, layer)
+    written_to = authoring.find_layer(stage, layer)
     stack_path = stack or _default_stack(stage)
     payload = Payload(
         operation=operation,
@@ -97,7 +104,7 @@ def add_edit(
         made_against=made_against or {},
         **_baked(operation, parameters, f"{stack_path}/{name}"),
     )
-    beside = sidecar or target.realPath
+    beside = sidecar or written_to.realPath
     written: tuple[Path, str] | None = None
     if beside:
         file, digests = write_payloads(
@@ -107,18 +114,23 @@ def add_edit(
     elif receiver_mask is not None or caster_mask is not None:
         raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
     try:
-        with authoring.writing(stage, target, stack_path):
+        with authoring.writing(stage, written_to, stack_path):
             if stack is None:
-                authoring.create_stack(stage, stack_path, layer=target)
+                authoring.create_stack(stage, stack_path, layer=written_to)
             path = authoring.add_edit(
                 stage,
                 stack_path,
                 name,
-                layer=target,
+                layer=written_to,
                 operation=operation,
                 parameters=parameters,
                 receivers=receivers,
                 casters=casters,
+                receiver_limits=receiver_limits,
+                caster_limits=caster_limits,
+                occluders=occluders,
+                lights=lights,
+                target=target,
                 amount=amount,
                 blend=blend,
                 payload=written,
@@ -161,18 +173,25 @@ def remove_edit(stage: Any, stack: str, edit: str, *, layer: str) -> None:
     _save(stage, layer)
 
 
+def add_region(stage: Any, path: str, *, layer: str, **values: Any) -> str:
+    """Make a region that limits can name and save the layer; see `stage.authoring.add_region`."""
+    region = authoring.add_region(stage, path, layer=layer, **values)
+    _save(stage, layer)
+    return region
+
+
+def add_selection(stage: Any, path: str, parts: Sequence[str], *, layer: str, rule: Rule | str) -> str:
+    """Make a selection of others that limits can name and save the layer; see `stage.authoring.add_selection`."""
+    selection = authoring.add_selection(stage, path, parts, layer=layer, rule=rule)
+    _save(stage, layer)
+    return selection
+
+
 def surfaces_below(stage: Any, members: Members, paths: Iterable[str]) -> list[str]:
-    """Those of the surface paths that lie at or below a member and not below an exclusion."""
-    default = stage.GetDefaultPrim()
-    root = str(default.GetPath()) if default else ""
-
-    def absolute(path: str) -> str:
-        return path if path.startswith("/") else f"{root}/{path}"
-
-    def below(path: str, tops: Sequence[str]) -> bool:
-        return any(path == top or path.startswith(top.rstrip("/") + "/") for top in map(absolute, tops))
-
-    return [path for path in paths if below(path, members.includes) and not below(path, members.excludes)]
+    """Those of the surface paths that members select; all of them where an expression does, which a mask narrows."""
+    if members.expression:
+        return list(paths)
+    return collections.surfaces_below(stage, members.includes, members.excludes, paths)
 
 
 def _baked(operation: str, parameters: Mapping[str, Value], where: str) -> BakedConstants:

@@ -209,7 +209,8 @@ class Session:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What the stage has and is not supported, and what is wrong with its edits."""
-        return self.snapshot.findings + self._read_stack()[1]
+        stack, findings = self._read_stack()
+        return self.snapshot.findings + findings + bind(stack, self.snapshot).findings
 
     # Images
 
@@ -266,6 +267,11 @@ class Session:
         parameters: Mapping[str, Value] | None = None,
         receivers: Members | Sequence[str] = (),
         casters: Members | Sequence[str] = (),
+        receiver_limits: Sequence[str] = (),
+        caster_limits: Sequence[str] = (),
+        occluders: Sequence[str] = (),
+        lights: Sequence[str] = (),
+        target: str | None = None,
         amount: float = 1.0,
         blend: Blend | str = Blend.COMPOSE,
         receiver_brush: Brush | None = None,
@@ -286,6 +292,10 @@ class Session:
             Layer of the stage's layer stack to write to, or "session".
         receivers, casters : paths or Members
             Prims that get, and prims that send, the edited light.
+        receiver_limits, caster_limits : paths
+            Materials, regions (Cube, Sphere), selections, collections or prims that narrow the two sides.
+        occluders, lights, target : paths, path
+            Prims that light passes, lights that the edit acts on, and the prim that it aims at.
         receiver_brush, caster_brush : Brush, optional
             Soft weights by position, painted on the selected surfaces; see `edits.painting`.
         frame : float, optional
@@ -314,6 +324,11 @@ class Session:
             parameters=parameters or {},
             receivers=receivers,
             casters=casters,
+            receiver_limits=receiver_limits,
+            caster_limits=caster_limits,
+            occluders=occluders,
+            lights=lights,
+            target=target,
             amount=amount,
             blend=blend,
             receiver_mask=self._paint(receivers, receiver_brush),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-from pxr import Sdf, Usd
+from pxr import Sdf, Tf, Usd
 
 from icheat_usd.edits.model import Selection
 from icheat_usd.errors import EditError
@@ -24,8 +24,17 @@ def select(edit: Usd.Prim, name: str, surface_paths: Iterable[str]) -> Selection
 
     A prim that is included takes its descendants along, instance proxies too, unless the collection's expansion
     rule says otherwise. Membership expressions are matched by USD, which knows only paths that the stage has.
+
+    Raises
+    ------
+    EditError
+        The membership expression asks for what this USD does not know.
     """
-    query = collection(edit, name).ComputeMembershipQuery()
+    try:
+        query = collection(edit, name).ComputeMembershipQuery()
+    except Tf.ErrorException as error:
+        reason = str(error).partition(" : ")[2].partition("\n")[0].strip().strip("'")
+        raise EditError(f"{edit.GetPath()}: the membership expression of {name} cannot be used ({reason})") from error
     return Selection(frozenset(path for path in set(surface_paths) if query.IsPathIncluded(Sdf.Path(path))))
 
 
@@ -50,6 +59,30 @@ def find_prims(stage: Usd.Stage, names: Iterable[str], what: str) -> tuple[Sdf.P
         A name matches nothing on the stage; the message suggests close paths.
     """
     return tuple(_find(stage, name, what) for name in names)
+
+
+def surfaces_below(
+    stage: Usd.Stage, includes: Iterable[str], excludes: Iterable[str], surface_paths: Iterable[str]
+) -> list[str]:
+    """Those of the surfaces that lie in or below an included prim or collection and not in or below an excluded one.
+
+    Names are as `find_prims` takes them.
+    """
+    paths = list(surface_paths)
+
+    def members(names: Iterable[str]) -> set[str]:
+        found: set[str] = set()
+        for path in find_prims(stage, names, "selection"):
+            if path.IsPrimPath() or path == Sdf.Path.absoluteRootPath:
+                top = str(path).rstrip("/")
+                found |= {p for p in paths if p == top or p.startswith(top + "/")}
+            else:
+                prim, name = stage.GetPrimAtPath(path.GetPrimPath()), path.name.partition(":")[2]
+                found |= select(prim, name, paths).paths
+        return found
+
+    wanted = members(includes) - members(excludes)
+    return [path for path in paths if path in wanted]
 
 
 def _find(stage: Usd.Stage, name: str, what: str) -> Sdf.Path:

@@ -27,6 +27,8 @@ from icheat_usd.stage.selections import limit_content, with_limits
 from icheat_usd.stage.spaces import in_scene_space
 from icheat_usd.stage.stacks import EditFinding, listed_edits, stack_prim, targets
 
+_NOTHING = Selection(frozenset())
+
 
 class PayloadReader(Protocol):
     """Reads one payload; how is up to whoever knows the file format."""
@@ -103,13 +105,15 @@ def _read_edit(
         path=path,
         operation=operation,
         parameters=read_parameters(prim, operation, time),
-        receivers=collections.select(prim, schema.RECEIVERS, surface_paths),
-        casters=collections.select(prim, schema.CASTERS, surface_paths),
+        receivers=_NOTHING,
+        casters=_NOTHING,
         amount=read_number(prim, schema.AMOUNT, time),
         blend=_blend(prim, time),
         enabled=bool(schema.read_attribute(prim, schema.ENABLED, time)),
         occluders=targets(prim, schema.OCCLUDERS),
     )
+    receivers, casters = (_select(prim, name, surface_paths, edit) for name in (schema.RECEIVERS, schema.CASTERS))
+    edit = replace(edit, receivers=receivers, casters=casters)
     findings = [
         EditFinding(path, name, f"selects no surface, so the edit does nothing; include prims in {name}")
         for name, selection in ((schema.RECEIVERS, edit.receivers), (schema.CASTERS, edit.casters))
@@ -123,6 +127,15 @@ def _read_edit(
         edit = _with_recipes(prim, replace(edit, keys=keys), time)
     edit, misplaced = in_scene_space(prim, edit, time)
     return edit, [*findings, *more, *misplaced]
+
+
+def _select(prim: Usd.Prim, name: str, surface_paths: frozenset[str], edit: Edit) -> Selection:
+    try:
+        return collections.select(prim, name, surface_paths)
+    except EditError:
+        if edit.is_active:
+            raise
+        return _NOTHING  # A muted edit is never in the way.
 
 
 def _read_key(prim: Usd.Prim, key: Key, weight: float, read_payload: PayloadReader | None) -> KeyedPayload:
