@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
-from icheat_usd.edits import operations
 from icheat_usd.errors import EditError, SidecarError
 from icheat_usd.stage import schema
 from icheat_usd.stage.authoring import (
@@ -254,20 +253,6 @@ def test_a_mistyped_parameter_means_nothing(stage: Usd.Stage) -> None:
     prim.CreateAttribute("icheat:scale:gian", Sdf.ValueTypeNames.Float).Set(3.0)
     (edit,) = read_edit_stack(stage, STACK, None, SURFACES)[0].edits
     assert dict(edit.parameters) == {"gain": 1.0, "color": (1.0, 1.0, 1.0)}
-
-
-def test_schemas_and_implementations_declare_the_same_operations() -> None:
-    declared = {
-        name: {parameter: schema.to_value(p.fallback) for parameter, p in operation.parameters.items()}
-        for name, operation in schema.operations().items()
-    }
-    assert declared == {name: implementation(name) for name in operations.names()}
-
-
-def implementation(name: str) -> dict[str, object]:
-    found = operations.find(name)
-    assert found is not None
-    return {parameter.name: parameter.default for parameter in found.parameters}
 
 
 # --------------------------------------------------------------------------- digest
