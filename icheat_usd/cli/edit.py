@@ -156,7 +156,7 @@ def add_command(options: argparse.Namespace) -> int:
         from icheat_usd.session import Session
 
         session = Session.open(stage, camera=options.camera, frame=options.frame, stack=options.stack)
-        values |= {f"{side}_brush": _brush(session, numbers) for side, numbers in spheres.items() if numbers}
+        values |= {f"{side}_brush": brush(session, numbers) for side, numbers in spheres.items() if numbers}
         path = session.add_edit(options.name, **values)
     else:
         stack = inspection.find_stack(stage, options.stack, options.camera)
@@ -189,7 +189,8 @@ def _related(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _brush(session: Any, numbers: tuple[float, ...]) -> Any:
+def brush(session: Any, numbers: tuple[float, ...]) -> Any:
+    """A soft sphere from metres in stage axes."""
     from icheat_usd.session import soft_sphere
 
     x, y, z = (float(value) - float(c) for value, c in zip(numbers[:3], session.snapshot.centre, strict=True))

@@ -19,7 +19,7 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.relight import Relighter, build_relighter
 from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
 from icheat_usd.scene import Finding, SceneSnapshot
-from icheat_usd.session import authoring, films
+from icheat_usd.session import authoring, films, keys
 from icheat_usd.session.quality import FINAL, PREVIEW, Quality
 from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
@@ -347,6 +347,35 @@ class Session:
         members = selected if isinstance(selected, Members) else Members(tuple(selected))
         paths = authoring.surfaces_below(self.stage, members, [s.path for s in self.snapshot.surfaces])
         return paint_mask(self.snapshot, paths, brush)
+
+    def set_key(
+        self,
+        edit: str,
+        *,
+        layer: str,
+        frame: float,
+        receiver_brush: Brush | None = None,
+        caster_brush: Brush | None = None,
+        **values: Any,
+    ) -> tuple[Finding, ...]:
+        """Set one keyframe of an edit and save the layer; see `session.keys.set_key`.
+
+        Parameters
+        ----------
+        receiver_brush, caster_brush : Brush, optional
+            Masks for this key, painted on what the edit selects, as it stands at `frame`.
+        """
+        if receiver_brush is not None or caster_brush is not None:
+            shot = self if self.frame == frame else Session.open(self.stage, camera=self.camera, frame=frame)
+            selected = next(found for found in self.stack.edits if found.path == edit)
+            for side, selection, brush in (
+                ("receiver_mask", selected.receivers, receiver_brush),
+                ("caster_mask", selected.casters, caster_brush),
+            ):
+                if brush is not None:
+                    values[side] = paint_mask(shot.snapshot, selection.paths, brush)
+            values["made_against"] = shot._made_against
+        return keys.set_key(self.stage, edit, layer=layer, frame=frame, **values)
 
     @property
     def _made_against(self) -> dict[str, str | float | int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from pxr import Sdf, Usd
@@ -17,7 +18,7 @@ from icheat_usd.stage.keys import (
     read_keys,
     strongest_opinion,
 )
-from icheat_usd.stage.layers import asset_path, overridden_opinions, writable_edit, writing
+from icheat_usd.stage.layers import asset_path, overridden_opinions, spec_path, writable_edit, writing
 from icheat_usd.stage.stacks import EditFinding
 
 #: customData of icheat:payload in a layer that copied another layer's keys: where they came from.
@@ -123,6 +124,41 @@ def set_key_interpolation(
     return overridden_opinions(prim, target, (schema.KEY_INTERPOLATION,), None)
 
 
+def release_parameters(
+    stage: Usd.Stage, edit: str, names: Iterable[str], *, layer: str | Sdf.Layer
+) -> tuple[EditFinding, ...]:
+    """Let keys decide parameters that have been authored for all times, as far as `layer` can.
+
+    What the layer says about them goes; what weaker layers say is blocked.
+
+    Parameters
+    ----------
+    names
+        Full names of attributes, such as ``icheat:scale:gain``.
+
+    Returns
+    -------
+    tuple of EditFinding
+        Parameters that a stronger layer goes on deciding.
+    """
+    prim = writable_edit(stage, edit)
+    with writing(stage, layer, prim.GetPath()) as target:
+        for name in names:
+            spec = target.GetAttributeAtPath(prim.GetPath().AppendProperty(name))
+            if spec:
+                del target.GetPrimAtPath(prim.GetPath()).properties[name]
+            attribute = prim.GetAttribute(name)
+            if attribute and attribute.HasAuthoredValue():
+                attribute.Block()
+    findings = []
+    for name in names:
+        opinion = strongest_opinion(prim.GetAttribute(name))
+        if opinion is not None and not opinion.is_blocked:
+            message = f"{opinion.layer.identifier} decides it at all times, so that keys do not; clear it there"
+            findings.append(EditFinding(str(prim.GetPath()), name, message))
+    return tuple(findings)
+
+
 def key_at(prim: Usd.Prim, time: float) -> Key:
     """The composed key at just this stage time.
 
@@ -147,7 +183,7 @@ def _check_interpolation(edit: str, interpolation: str | None) -> None:
 
 def _clear_keys(prim: Usd.Prim, layer: Sdf.Layer) -> None:
     for name in (schema.PAYLOAD, schema.FILE_PATH):
-        spec = layer.GetAttributeAtPath(prim.GetPath().AppendProperty(name))
+        spec = layer.GetAttributeAtPath(spec_path(prim.GetStage(), prim.GetPath().AppendProperty(name)))
         if spec:
             for time in layer.ListTimeSamplesForPath(spec.path):
                 layer.EraseTimeSample(spec.path, time)
@@ -159,11 +195,12 @@ def _own_keys(prim: Usd.Prim, layer: Sdf.Layer) -> None:
     """Make `layer` the one that decides the keys, by copying all composed ones."""
     track = read_keys(prim)
     opinion = strongest_opinion(prim.GetAttribute(schema.PAYLOAD))
-    if track is None or opinion is None or opinion.layer == layer or not track.times:
+    own = spec_path(prim.GetStage(), prim.GetPath().AppendProperty(schema.PAYLOAD))
+    if track is None or opinion is None or (opinion.layer, opinion.path) == (layer, own) or not track.times:
         return
     for key in track.keys:
         write_key(prim, layer, key.time, asset_path(layer, key.anchored) if key.digest else None, key.digest)
-    spec = layer.GetAttributeAtPath(prim.GetPath().AppendProperty(schema.PAYLOAD))
+    spec = layer.GetAttributeAtPath(own)
     source = opinion.layer.realPath or opinion.layer.identifier
     if spec:
         spec.customData[COPIED_FROM] = {"layer": asset_path(layer, source), "keys": track.digest}
@@ -215,7 +252,7 @@ def write_key(prim: Usd.Prim, layer: Sdf.Layer, time: float | None, asset: str |
 
 def _erase_sample(prim: Usd.Prim, layer: Sdf.Layer, name: str, stage_time: float) -> None:
     """Drop a sample at the same stage time that rounding of the layer offset moved by a hair."""
-    path = prim.GetPath().AppendProperty(name)
+    path = spec_path(prim.GetStage(), prim.GetPath().AppendProperty(name))
     target = prim.GetStage().GetEditTargetForLocalLayer(layer)
     offset = target.GetMapFunction().timeOffset
     for layer_time in layer.ListTimeSamplesForPath(path):
