@@ -188,9 +188,9 @@ def add_selection(stage: Any, path: str, parts: Sequence[str], *, layer: str, ru
 
 
 def surfaces_below(stage: Any, members: Members, paths: Iterable[str]) -> list[str]:
-    """Those of the surface paths that members select; all of them where an expression does, which a mask narrows."""
+    """Those of the surface paths that members select."""
     if members.expression:
-        return list(paths)
+        return collections.surfaces_matching(stage, members.expression, paths)
     return collections.surfaces_below(stage, members.includes, members.excludes, paths)
 
 

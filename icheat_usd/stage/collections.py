@@ -85,6 +85,49 @@ def surfaces_below(
     return [path for path in paths if path in wanted]
 
 
+def surfaces_matching(stage: Usd.Stage, expression: str, surface_paths: Iterable[str]) -> list[str]:
+    """Those of the surfaces that a membership expression selects; relative patterns are below the default prim.
+
+    Raises
+    ------
+    EditError
+        The expression is ill-formed or asks for what this USD does not know.
+    """
+    paths = list(surface_paths)
+    # USD matches expressions for collections alone, so one is made where no one sees it: on a stage of the same
+    # layers, with a session layer of its own.
+    session = Sdf.Layer.CreateAnonymous()
+    if stage.GetSessionLayer():
+        session.subLayerPaths.append(stage.GetSessionLayer().identifier)
+    same = Usd.Stage.Open(stage.GetRootLayer(), session, stage.GetPathResolverContext(), Usd.Stage.LoadNone)
+    same.MuteAndUnmuteLayers(stage.GetMutedLayers(), [])
+    same.SetLoadRules(stage.GetLoadRules())
+    same.SetEditTarget(session)
+    holder = same.OverridePrim("/icheatSelection")
+    chosen = Usd.CollectionAPI.Apply(holder, "chosen")
+    chosen.CreateIncludeRootAttr().Set(False)
+    chosen.CreateMembershipExpressionAttr().Set(parse_expression(stage, expression, "selection"))
+    wanted = select(holder, "chosen", paths).paths
+    return [path for path in paths if path in wanted]
+
+
+def parse_expression(stage: Usd.Stage, text: str, where: str) -> Sdf.PathExpression:
+    """A membership expression with absolute patterns; relative ones are below the default prim.
+
+    Raises
+    ------
+    EditError
+        It is ill-formed.
+    """
+    default = stage.GetDefaultPrim()
+    try:
+        expression = Sdf.PathExpression(text)
+    except Tf.ErrorException as error:
+        reason = str(error).partition(" : ")[2].strip().strip("'") or "unknown reason"
+        raise EditError(f"{where}: '{text}' is no membership expression ({reason})") from error
+    return expression.MakeAbsolute(default.GetPath() if default else Sdf.Path.absoluteRootPath)
+
+
 def _find(stage: Usd.Stage, name: str, what: str) -> Sdf.Path:
     if not Sdf.Path.IsValidPathString(name):
         raise EditError(f"{what}: '{name}' is not a prim path; give one such as /World/Room/floor")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from icheat_usd.edits.model import Rule, Shape
 from icheat_usd.errors import EditError
@@ -59,23 +59,13 @@ def set_members(prim: Usd.Prim, name: str, members: Members | Sequence[str]) -> 
         _author_difference(collection.GetIncludesRel(), collections.find_prims(stage, wanted.includes, where)),
         _author_difference(collection.GetExcludesRel(), collections.find_prims(stage, wanted.excludes, where)),
     ]
-    expression = _checked_expression(stage, wanted.expression, where)
+    expression = collections.parse_expression(stage, wanted.expression, where)
     attribute = collection.GetMembershipExpressionAttr()
     if expression != ((attribute.Get() if attribute else None) or Sdf.PathExpression()):
         attribute = collection.CreateMembershipExpressionAttr()
         attribute.Set(expression)
         as_wanted.append(attribute.Get() == expression)
     return all(as_wanted)
-
-
-def _checked_expression(stage: Usd.Stage, text: str, where: str) -> Sdf.PathExpression:
-    default = stage.GetDefaultPrim()
-    try:
-        expression = Sdf.PathExpression(text)
-    except Tf.ErrorException as error:
-        reason = str(error).partition(" : ")[2].strip().strip("'") or "unknown reason"
-        raise EditError(f"{where}: '{text}' is no membership expression ({reason})") from error
-    return expression.MakeAbsolute(default.GetPath() if default else Sdf.Path.absoluteRootPath)
 
 
 def set_targets(prim: Usd.Prim, wanted: Mapping[str, Sequence[str] | None]) -> list[str]:
