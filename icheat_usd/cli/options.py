@@ -6,7 +6,7 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -115,3 +115,14 @@ def finding_as_text(finding: Any) -> str:
     severity = getattr(finding, "severity", "warning")
     place = " ".join(part for part in (finding.prim, finding.feature) if part)
     return f"{severity}: {place}: {finding.message}"
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of cells as lines with columns; nothing follows the last cell of a row."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def file_size(n: int) -> str:
+    """Bytes as people read them."""
+    return f"{n} B" if n < 1000 else f"{n / 1000:.3g} kB" if n < 999_500 else f"{n / 1e6:.3g} MB"

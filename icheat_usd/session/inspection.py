@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from icheat_usd.scene import Finding
 from icheat_usd.session.authoring import read_payload
 from icheat_usd.stage import open_stage, schema
-from icheat_usd.stage.check import check_stage
+from icheat_usd.stage.check import RULES, check_stage
 from icheat_usd.stage.description import EditDescription, describe_edit
 from icheat_usd.stage.list_edits import Listing, listings
 from icheat_usd.stage.opening import composition_findings
@@ -65,4 +65,26 @@ def check(stage: Any, frame: float | None = None) -> tuple[Finding, ...]:
     return (*composition_findings(stage), *check_stage(stage, frame, read_payload))
 
 
-__all__ = ["StackDescription", "check", "describe_stack", "describe_stacks", "find_stack", "open_stage"]
+class RuleDescription(NamedTuple):
+    """One rule of `check`."""
+
+    name: str
+    severity: str
+    doc: str  #: what holds on a good stage
+
+
+def check_rules() -> tuple[RuleDescription, ...]:
+    """Every rule, in the order in which `check` applies them."""
+    return tuple(RuleDescription(type(rule).__name__, rule.severity.value, rule.doc) for rule in RULES)
+
+
+__all__ = [
+    "RuleDescription",
+    "check_rules",
+    "StackDescription",
+    "check",
+    "describe_stack",
+    "describe_stacks",
+    "find_stack",
+    "open_stage",
+]

@@ -10,6 +10,7 @@ from pxr import Usd, UsdGeom
 from icheat_usd.edits import operations, staleness
 from icheat_usd.edits.model import Payload, SurfaceMask, Value
 from icheat_usd.edits.operations import Operation
+from icheat_usd.edits.operations.constants import baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.stage import schema
 from icheat_usd.stage.check.rule import Context, Found, Rule
@@ -138,23 +139,18 @@ def painted_changes(stage: Usd.Stage, payload: Payload, time: float | None) -> I
 
 
 def _same_constants(operation: Operation, payload: Payload, authored: Mapping[str, Value]) -> bool:
-    given = {**payload.parameters, **authored}
     try:
-        now = operation.constants(operation.complete(given, operation.name))
+        now = baked_constants(operation, operation.complete({**payload.parameters, **authored}, operation.name))
     except EditError:
         return False
-    if now is None:
-        return False
 
-    def same(baked: tuple[float, float, float] | None, value: object, identity: float) -> bool:
-        was = np.zeros(3) if baked is None else np.asarray(baked, np.float64)
-        is_ = np.zeros(3) if value is None else np.asarray(value, np.float64).reshape(-1, 3)[0] - identity
-        return bool(np.allclose(was, is_, rtol=1e-5, atol=1e-6))
+    def same(was: tuple[float, float, float] | None, is_: tuple[float, float, float] | None) -> bool:
+        return bool(np.allclose(was or (0.0, 0.0, 0.0), is_ or (0.0, 0.0, 0.0), rtol=1e-5, atol=1e-6))
 
-    return (
-        same(payload.scale_delta, now.scale, 1.0)
-        and same(payload.emission, now.emission, 0.0)
-        and same(payload.offset, now.offset, 0.0)
+    return bool(now) and (
+        same(payload.scale_delta, now.get("scale_delta"))
+        and same(payload.emission, now.get("emission"))
+        and same(payload.offset, now.get("offset"))
     )
 
 
