@@ -25,7 +25,7 @@ from icheat_usd.stage import collections, schema
 from icheat_usd.stage.key_authoring import set_payload_key as set_payload_key
 from icheat_usd.stage.key_authoring import write_key
 from icheat_usd.stage.keys import strongest_opinion
-from icheat_usd.stage.layers import asset_path, overridden_opinions, refuse_instances, writable_edit
+from icheat_usd.stage.layers import asset_path, overridden_opinions, refuse_instances, spec_path, writable_edit
 from icheat_usd.stage.layers import find_layer as find_layer
 from icheat_usd.stage.layers import reload_layer as reload_layer
 from icheat_usd.stage.layers import remember_layer as remember_layer
@@ -105,6 +105,7 @@ def add_edit(
     time: float | None = None,
     before: str | None = None,
     after: str | None = None,
+    variant: tuple[str, str] | None = None,
 ) -> str:
     """Add an edit to a stack, after those it has unless `before` or `after` says otherwise.
 
@@ -128,6 +129,8 @@ def add_edit(
         (file, digest) of painted or baked data; written relative to the layer's own file.
     time
         Stage time of the values and of the payload's key; None authors defaults.
+    variant
+        (set, variant) of the stack's prim, or of one above it, to write into; another one may be selected.
 
     Returns
     -------
@@ -143,10 +146,10 @@ def add_edit(
     if not Sdf.Path.IsValidIdentifier(name):
         raise EditError(f"'{name}' cannot name an edit; use letters, digits and underscores")
     path = prim.GetPath().AppendChild(name)
-    if stage.GetPrimAtPath(path):
-        raise EditError(f"{path} exists already; choose another name or set its values")
     refuse_instances(stage, path)
-    with writing(stage, layer, prim.GetPath()) as written_to:
+    with writing(stage, layer, prim.GetPath(), variant) as written_to:
+        if stage.GetPrimAtPath(path):
+            raise EditError(f"{path} exists already; choose another name or set its values")
         edit = stage.DefinePrim(path, "Scope")
         apply_schema(edit, schema.EDIT_API)
         _set_operation(edit, operation, parameters or {}, time, has_payload=payload is not None)
@@ -184,6 +187,7 @@ def move_edit(
     layer: str | Sdf.Layer,
     before: str | None = None,
     after: str | None = None,
+    variant: tuple[str, str] | None = None,
 ) -> None:
     """Move an edit before or after another one; to the end, the strongest place, if neither is given.
 
@@ -196,11 +200,13 @@ def move_edit(
         An edit is not in the stack, or a stronger layer decides the order.
     """
     prim = stack_prim(stage, stack)
-    with writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath(), variant) as target:
         _move(prim, _listed(prim, edit), target, before=before, after=after)
 
 
-def remove_edit(stage: Usd.Stage, stack: str, edit: str, *, layer: str | Sdf.Layer) -> None:
+def remove_edit(
+    stage: Usd.Stage, stack: str, edit: str, *, layer: str | Sdf.Layer, variant: tuple[str, str] | None = None
+) -> None:
     """Take an edit out of a stack, and drop what the layer says about it.
 
     What weaker layers say about the edit stays; they are not written to.
@@ -211,8 +217,8 @@ def remove_edit(stage: Usd.Stage, stack: str, edit: str, *, layer: str | Sdf.Lay
         The edit is not in the stack, or a stronger layer lists it.
     """
     prim = stack_prim(stage, stack)
-    path = _listed(prim, edit)
-    with writing(stage, layer, prim.GetPath()) as target:
+    with writing(stage, layer, prim.GetPath(), variant) as target:
+        path = _listed(prim, edit)
         relationship = _relationship(prim, schema.EDITS)
         relationship.RemoveTarget(path)
         if path in relationship.GetTargets():
@@ -222,12 +228,12 @@ def remove_edit(stage: Usd.Stage, stack: str, edit: str, *, layer: str | Sdf.Lay
                 if spec.layer != target and path in spec.targetPathList.GetAddedOrExplicitItems()
             ]
             raise EditError(f"{path} is listed by {', '.join(stronger)}, which is stronger; remove it there")
-        items = target.GetRelationshipAtPath(relationship.GetPath()).targetPathList
+        items = target.GetRelationshipAtPath(spec_path(stage, relationship.GetPath())).targetPathList
         if not items.isExplicit:
             items.deletedItems.remove(path)
             if path in relationship.GetTargets():  # A weaker layer lists it, so that the deletion is needed.
                 items.deletedItems.append(path)
-        if target.GetPrimAtPath(path):
+        if target.GetPrimAtPath(spec_path(stage, path)):
             stage.RemovePrim(path)
 
 
@@ -257,10 +263,10 @@ def _move(stack: Usd.Prim, path: Sdf.Path, layer: Sdf.Layer, *, before: str | No
     if wanted == composed:
         return
     first = next(i for i, (a, b) in enumerate(zip(wanted, composed, strict=True)) if a != b)
-    spec = layer.GetRelationshipAtPath(relationship.GetPath())
-    if spec is None:
+    place = spec_path(stack.GetStage(), relationship.GetPath())
+    if layer.GetRelationshipAtPath(place) is None:
         _append(relationship, path)
-        spec = layer.GetRelationshipAtPath(relationship.GetPath())
+    spec = layer.GetRelationshipAtPath(place)
     items = spec.targetPathList
     if items.isExplicit:
         own = list(items.explicitItems)
@@ -271,7 +277,9 @@ def _move(stack: Usd.Prim, path: Sdf.Path, layer: Sdf.Layer, *, before: str | No
         items.deletedItems = [p for p in items.deletedItems if p not in tail]
         items.appendedItems = [p for p in items.appendedItems if p not in tail] + tail
     if list(relationship.GetTargets()) != wanted:
-        raise EditError(f"{stack.GetPath()}: a layer stronger than {layer.identifier} decides the order; move it there")
+        in_variant = place.ContainsPrimVariantSelection()
+        stronger = "what a layer says beside the variant" if in_variant else f"a layer stronger than {layer.identifier}"
+        raise EditError(f"{stack.GetPath()}: {stronger} decides the order; move it there")
 
 
 # --------------------------------------------------------------------------- values
@@ -295,11 +303,14 @@ def set_edit(
     lights: Sequence[str] | None = None,
     target: str | None = None,
     time: float | None = None,
+    variant: tuple[str, str] | None = None,
 ) -> tuple[EditFinding, ...]:
     """Author values of an edit; what is None stays as it is, an empty list or target takes away.
 
     A selection is authored as the difference from the composed one, so that
-    later additions of weaker layers still join it.
+    later additions of weaker layers still join it. A variant (set, variant) is
+    that of the edit's prim or of one above it, such as the stack's; what layers
+    say beside it is stronger than what they say in it.
 
     Returns
     -------
@@ -311,10 +322,11 @@ def set_edit(
     EditError
         Something named does not exist or does not fit; the layer is then as before.
     """
-    prim = writable_edit(stage, edit)
+    path = edit if variant is not None else writable_edit(stage, edit).GetPath()
     written: list[str] = []
     selections: list[EditFinding] = []
-    with writing(stage, layer, prim.GetPath()) as written_to:
+    with writing(stage, layer, path, variant) as written_to:
+        prim = writable_edit(stage, edit)
         if operation is not None or parameters:
             token = operation or str(schema.read_attribute(prim, schema.OPERATION, time))
             has_payload = strongest_opinion(prim.GetAttribute(schema.PAYLOAD)) is not None
@@ -337,12 +349,19 @@ def set_edit(
         for name in set_targets(prim, _related(receiver_limits, caster_limits, occluders, lights, target)):
             message = f"authored in {written_to.identifier}, but a stronger layer changes the targets"
             selections.append(EditFinding(str(prim.GetPath()), name, message))
-    return (*overridden_opinions(prim, written_to, written, time), *selections)
+        return (*overridden_opinions(prim, written_to, written, time), *selections)
 
 
-def mute_edit(stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, muted: bool = True) -> tuple[EditFinding, ...]:
+def mute_edit(
+    stage: Usd.Stage,
+    edit: str,
+    *,
+    layer: str | Sdf.Layer,
+    muted: bool = True,
+    variant: tuple[str, str] | None = None,
+) -> tuple[EditFinding, ...]:
     """Mute or unmute an edit; see `set_edit`."""
-    return set_edit(stage, edit, layer=layer, enabled=not muted)
+    return set_edit(stage, edit, layer=layer, enabled=not muted, variant=variant)
 
 
 def _related(

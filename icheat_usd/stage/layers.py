@@ -17,6 +17,7 @@ from icheat_usd.stage import schema
 from icheat_usd.stage.keys import strongest_opinion
 from icheat_usd.stage.locking import locked
 from icheat_usd.stage.stacks import EditFinding, edit_prim
+from icheat_usd.stage.variants import selected_variant, variant_target
 
 #: Layers whose file is larger than this are not compared with it before the first edit.
 _MAX_COMPARED_BYTES = 8 << 20
@@ -129,32 +130,43 @@ def _first_line(error: Tf.ErrorException) -> str:
 
 
 @contextmanager
-def writing(stage: Usd.Stage, layer: str | Sdf.Layer, path: str | Sdf.Path) -> Iterator[Sdf.Layer]:
+def writing(
+    stage: Usd.Stage, layer: str | Sdf.Layer, path: str | Sdf.Path, variant: tuple[str, str] | None = None
+) -> Iterator[Sdf.Layer]:
     """Write opinions at or below `path` to a layer, times mapped into it.
 
-    USD's refusals become errors; after any error the layer says what it said before.
+    With `variant` (set, variant) they are written into that variant of the nearest prim at or above `path` that has
+    the set, and it is selected meanwhile. USD's refusals become errors; after any error the layer says what it said
+    before.
     """
     schema.require_registered()
     target = find_layer(stage, layer)
-    path = Sdf.Path(path)
-    before = Sdf.Layer.CreateAnonymous()
-    existed = bool(target.GetPrimAtPath(path))
-    if existed:
-        Sdf.CreatePrimInLayer(before, path)
-        Sdf.CopySpec(target, path, before, path)
-    first_new = next((prefix for prefix in path.GetPrefixes() if not target.GetPrimAtPath(prefix)), path)
-    try:
-        with Usd.EditContext(stage, stage.GetEditTargetForLocalLayer(target)):
-            yield target
-    except BaseException as error:
+    with selected_variant(stage, str(path), variant) as place:
+        path = Sdf.Path(path) if place is None else place.GetPrimPath()
+        before = Sdf.Layer.CreateAnonymous()
+        existed = bool(target.GetPrimAtPath(path))
         if existed:
-            Sdf.CopySpec(before, path, target, path)
-        elif target.GetPrimAtPath(first_new):
-            siblings = target.GetPrimAtPath(first_new.GetParentPath()).nameChildren
-            del siblings[first_new.name]
-        if isinstance(error, Tf.ErrorException):
-            raise EditError(f"{target.identifier}: USD refused the edit ({_first_line(error)})") from error
-        raise
+            Sdf.CreatePrimInLayer(before, path)
+            Sdf.CopySpec(target, path, before, path)
+        first_new = next((prefix for prefix in path.GetPrefixes() if not target.GetPrimAtPath(prefix)), path)
+        try:
+            local = stage.GetEditTargetForLocalLayer(target)
+            with Usd.EditContext(stage, local if place is None else variant_target(stage, target, place)):
+                yield target
+        except BaseException as error:
+            if existed:
+                Sdf.CopySpec(before, path, target, path)
+            elif target.GetPrimAtPath(first_new):
+                siblings = target.GetPrimAtPath(first_new.GetParentPath()).nameChildren
+                del siblings[first_new.name]
+            if isinstance(error, Tf.ErrorException):
+                raise EditError(f"{target.identifier}: USD refused the edit ({_first_line(error)})") from error
+            raise
+
+
+def spec_path(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
+    """Where opinions on a stage's path lie in the layer that is written to: in a variant, if that is written to."""
+    return stage.GetEditTarget().MapToSpecPath(path)
 
 
 def reload_layer(layer: Sdf.Layer) -> None:
@@ -200,8 +212,10 @@ def overridden_opinions(
     findings = []
     for name in names:
         opinion = strongest_opinion(prim.GetAttribute(name), time)
-        if opinion is not None and opinion.layer != layer:
-            message = f"authored in {layer.identifier}, but {opinion.layer.identifier} is stronger and decides"
+        here = spec_path(prim.GetStage(), prim.GetPath().AppendProperty(name))
+        if opinion is not None and (opinion.layer != layer or opinion.path != here):
+            place = "" if opinion.layer != layer else f" at {opinion.path}"
+            message = f"authored in {layer.identifier}, but {opinion.layer.identifier}{place} is stronger and decides"
             findings.append(EditFinding(str(prim.GetPath()), name, message))
         elif opinion is not None and opinion.source != "default" and time is None:
             message = f"authored without a time in {layer.identifier}, where time samples or a spline decide"
