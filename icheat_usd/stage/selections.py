@@ -109,14 +109,19 @@ class _LimitReader:
         if prim.IsA(UsdGeom.Cube) or prim.IsA(UsdGeom.Sphere):
             return read_region(prim, self.time)
         below = str(path) + "/"
-        return SurfacesAt(frozenset(p for p in self.surface_paths if p == str(path) or p.startswith(below)))
+        return self._surfaces(path, frozenset(p for p in self.surface_paths if p == str(path) or p.startswith(below)))
 
     def _read_collection(self, prim: Usd.Prim, path: Sdf.Path) -> Limit:
         namespace, _, name = path.name.partition(":")
         if namespace != "collection" or not name or not prim.GetPropertiesInNamespace(path.name):
             self._find(path, "is no collection, so that it selects nothing; name a prim or a collection")
             return _NOTHING
-        return SurfacesAt(collections.select(prim, name, self.surface_paths).paths)
+        return self._surfaces(path, collections.select(prim, name, self.surface_paths).paths)
+
+    def _surfaces(self, path: Sdf.Path, paths: frozenset[str]) -> SurfacesAt:
+        if not paths:
+            self._find(path, "holds no surface that is shown, so that it selects nothing; name another")
+        return SurfacesAt(paths)
 
     def _read_combination(self, prim: Usd.Prim, within: tuple[Sdf.Path, ...]) -> Combination:
         path = prim.GetPath()

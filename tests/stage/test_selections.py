@@ -322,6 +322,15 @@ def test_a_missing_target_selects_nothing_and_is_reported(stage: Usd.Stage, targ
     assert stack.edits[0].receivers.limits == (SurfacesAt(frozenset()),)  # type: ignore[attr-defined]
 
 
+def test_a_limit_without_surfaces_is_reported(stage: Usd.Stage) -> None:
+    limit(stage, "/World/camera")
+    stack, findings, _ = read(stage)
+    assert [f.message for f in findings] == [
+        "/World/camera holds no surface that is shown, so that it selects nothing; name another"
+    ]
+    assert stack.edits[0].receivers.limits == (SurfacesAt(frozenset()),)  # type: ignore[attr-defined]
+
+
 def test_every_limit_decides_the_digest(stage: Usd.Stage) -> None:
     bind_material(stage)
     box(stage, "/World/box", (0, 0, 0), (50, 50, 50))
@@ -407,7 +416,7 @@ stage = Usd.Stage.Open(sys.argv[1])
 stack, findings = read_edit_stack(stage, "/World/Edits", None, ["/World/near", "/World/far"])
 edit = stack.edits[0]
 limits = [limit_content(limit) for limit in edit.receivers.limits]
-found = {"limits": limits, "lights": edit.lights, "target": edit.target, "digest": stack.digest}
+found = {"casters": sorted(edit.casters.paths), "limits": limits, "lights": edit.lights, "target": edit.target, "digest": stack.digest}
 print(json.dumps({"registered": schema.is_registered(), "findings": len(findings), **found}))
 """
 
@@ -419,12 +428,16 @@ def test_a_host_that_composed_first_reads_the_same(stage: Usd.Stage, tmp_path: P
     limit(stage, "/World/Edits/set", "/World/near", f"{EDIT}.collection:{schema.RECEIVERS}")
     edit = stage.GetPrimAtPath(EDIT)
     edit.GetRelationship(schema.LIGHTS).SetTargets(["/World/near"])
+    casters = Usd.CollectionAPI(edit, schema.CASTERS)
+    casters.GetIncludesRel().ClearTargets(True)
+    casters.CreateMembershipExpressionAttr().Set(Sdf.PathExpression("//{isa:Mesh} - /World/far"))
     edit.GetRelationship(schema.TARGET).SetTargets(["/World/box"])
     stage.GetRootLayer().Export(str(tmp_path / "scene.usda"))
     early = json.loads(python("import icheat_usd\nfrom pxr import Usd\n" + READ, str(tmp_path / "scene.usda")))
     late = json.loads(python(LATE + READ, str(tmp_path / "scene.usda")))
     assert (early.pop("registered"), late.pop("registered")) == (True, False)
     assert early == late
+    assert early["casters"] == ["/World/near"]
     assert early["findings"] == 1 and len(early["limits"]) == 3 and early["target"] == [0, 0, 0]
     assert early["limits"][0][1][0][2] == (0.25).hex() and early["limits"][2][1] == ["/World/far", "/World/near"]
 
