@@ -24,6 +24,7 @@ VERBS = (
     "selection",
     "tree",
     "cat",
+    "diff",
     "stats",
     "check",
     "plugin_path",

@@ -57,6 +57,7 @@ def _lines(found: Any) -> list[str]:
     lines = aligned(rows)
     for sidecar in found.sidecars:
         unused = sidecar.payloads - sidecar.used
-        about = f"{sidecar.used} of {sidecar.payloads} payloads used here" if unused else f"{sidecar.used} payload{'s' * (sidecar.used != 1)}"
+        about = f"{sidecar.used} payload{'s' * (sidecar.used != 1)}"
+        about = f"{sidecar.used} of {sidecar.payloads} payloads used here" if unused else about
         lines.append(f"{sidecar.file}  {file_size(sidecar.file_bytes)}, {about}")
     return [*lines, *(f"problem: {problem}" for problem in found.problems)]
