@@ -12,14 +12,29 @@ from icheat_usd.sidecar import list_payloads
 from . import animated_room, cornell_box, furnished_room, glossy_set, images, staircase
 from .build import write_over_layer
 from .edits import author_edits
+from .operations import FOLDER as OPERATIONS
+from .operations import SHOWN, build_operations
 
 STAGES: dict[str, ModuleType] = {
     module.NAME: module for module in (cornell_box, furnished_room, glossy_set, staircase, animated_room)
 }
 
 
+#: Folders that `build_stage` can write.
+NAMES = (*STAGES, OPERATIONS)
+
+
 def build_stage(name: str, folder: Path) -> None:
-    """Write one sample stage: scene.usda, textures, sequence.usda and shot.usda with their edits."""
+    """Write one sample stage: scene.usda, textures, sequence.usda and shot.usda with their edits.
+
+    The folder of operations has a layer for each, over the scenes beside it; those that are missing are made.
+    """
+    if name == OPERATIONS:
+        for scene in {shown.scene for shown in SHOWN}:
+            if not (folder.parent / scene / "scene.usda").exists():
+                STAGES[scene].build(folder.parent / scene)
+        build_operations(folder)
+        return
     module = STAGES[name]
     module.build(folder)
     # Sidecars are write-once: without this a second run would make version 2 of them.

@@ -302,7 +302,7 @@ def _set(op: UsdGeom.XformOp, value: Animated, kind: type) -> None:
 def write_over_layer(path: Path, weaker: str, doc: str, frames: tuple[int, int] | None = None) -> Sdf.Layer:
     """A layer that sublayers `weaker` and says nothing yet, with the stage metadata a root layer needs."""
     layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.subLayerPaths = [f"./{weaker}"]
+    layer.subLayerPaths = [weaker if weaker.startswith("../") else f"./{weaker}"]
     layer.documentation = doc
     layer.defaultPrim = "World"
     root = layer.pseudoRoot

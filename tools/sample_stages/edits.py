@@ -14,6 +14,7 @@ from icheat_usd.session.authoring import surfaces_below
 from icheat_usd.sidecar import write_payloads
 from icheat_usd.stage import authoring, open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
+from icheat_usd.stage.selection_authoring import add_region
 
 STACK = "/World/Edits"
 
@@ -36,7 +37,12 @@ class New:
     amount: float = 1.0
     receiver_sphere: Sphere | None = None
     caster_sphere: Sphere | None = None
+    receiver_region: Sphere | None = None  #: limits the receivers by a Sphere prim instead of paint
     keys: Mapping[float, Mapping[str, Value]] = field(default_factory=dict)  #: parameters by frame
+    occluders: Sequence[str] = ()
+    lights: Sequence[str] = ()
+    target: str | None = None
+    needs_payload: bool = True  #: False: what USD says is all there is
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,7 @@ def author_edits(path: Path, edits: Sequence[New | Override], make_stack: bool) 
         _payload(stage, snapshot, edit, {**edit.parameters, **parameters})
         for edit in made
         for parameters in recipes[edit.name].values()
+        if edit.needs_payload
     ]
     file, digests = write_payloads(path, payloads, anchor="/World") if payloads else (path, [])
     remaining = iter(digests)
@@ -76,8 +83,9 @@ def author_edits(path: Path, edits: Sequence[New | Override], make_stack: bool) 
                 enabled=edit.enabled,
             )
             continue
-        keys = {time: next(remaining) for time in recipes[edit.name]}
-        first = next(iter(keys))
+        keys = {time: next(remaining) for time in recipes[edit.name] if edit.needs_payload}
+        first = next(iter(keys), None)
+        limits = () if edit.receiver_region is None else (_region(stage, layer, edit),)
         prim = authoring.add_edit(
             stage,
             STACK,
@@ -89,13 +97,25 @@ def author_edits(path: Path, edits: Sequence[New | Override], make_stack: bool) 
             receivers=edit.receivers,
             casters=edit.casters,
             amount=edit.amount,
-            payload=(file, keys[first]),
+            occluders=edit.occluders,
+            lights=edit.lights,
+            target=edit.target,
+            receiver_limits=limits,
+            payload=(file, keys[first]) if keys else None,
             time=first,
         )
         for time, digest in list(keys.items())[1:]:
             authoring.set_payload_key(stage, prim, layer=layer, time=time, payload=(file, digest))
         stage.GetRootLayer().GetPrimAtPath(prim).documentation = edit.doc
     authoring.save_layer(stage.GetRootLayer())
+
+
+def _region(stage: object, layer: str, edit: New) -> str:
+    assert edit.receiver_region is not None
+    x, y, z, inner, outer = edit.receiver_region
+    path = f"/World/Regions/{edit.name}"
+    add_region(stage, path, layer=layer, shape="sphere", centre=(x, y, z), size=(outer,), softness=1 - inner / outer)
+    return path
 
 
 def _payload(stage: object, snapshot: SceneSnapshot, edit: New, parameters: Mapping[str, Value]) -> Payload:
@@ -107,9 +127,19 @@ def _payload(stage: object, snapshot: SceneSnapshot, edit: New, parameters: Mapp
         parameters=dict(parameters),
         receiver_mask=_mask(stage, snapshot, edit.receivers, edit.receiver_sphere),
         caster_mask=_mask(stage, snapshot, edit.casters, edit.caster_sphere),
-        scale_delta=operation.constant_delta(operation.complete(parameters, edit.name)),
+        scale_delta=_delta(operation, parameters, edit.name),
         made_against={"camera": "/World/Cameras/Main"},
     )
+
+
+def _delta(
+    operation: operations.Operation, parameters: Mapping[str, Value], where: str
+) -> tuple[float, float, float] | None:
+    constants = operation.constants(operation.complete(parameters, where))
+    if constants is None:
+        return None
+    red, green, blue = (float(factor) - 1 for factor in constants.scale[0])
+    return red, green, blue
 
 
 def _mask(stage: object, snapshot: SceneSnapshot, members: Sequence[str], sphere: Sphere | None) -> SurfaceMask | None:
