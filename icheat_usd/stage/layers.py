@@ -52,6 +52,8 @@ def find_layer(stage: Usd.Stage, layer: str | Sdf.Layer) -> Sdf.Layer:
         )
     if not matches[0].permissionToEdit:
         raise EditError(f"layer '{matches[0].identifier}' may not be edited; name another layer")
+    if matches[0].GetFileFormat().IsPackage() or Ar.IsPackageRelativePath(matches[0].identifier):
+        raise EditError(f"layer '{matches[0].identifier}' lies in a package, which is read-only; write to one over it")
     remember_layer(matches[0])
     return matches[0]
 

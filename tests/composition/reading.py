@@ -62,7 +62,7 @@ def provenance(stage: Usd.Stage, opened: dict[str, Any]) -> dict[str, dict[str, 
     """File names of the layers that decide each value, list each edit, and take edits out."""
 
     def name(identifier: str) -> str:
-        return identifier if not identifier else Path(identifier).name.rpartition(":")[2]
+        return Path(identifier.rstrip("]").rpartition("[")[2]).name.rpartition(":")[2] if identifier else ""
 
     found = {"removed": {}, "winners": {}}  # type: dict[str, dict[str, str]]
     for listing in listings(stack_prim(stage, opened["stack"])):

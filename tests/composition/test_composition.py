@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from icheat_usd.errors import SidecarError
 from tests.composition import cases_of_arcs, cases_of_layers
 from tests.composition.reading import read_case
 from tests.composition.stages import Case, retimed, write_case, write_flat
@@ -47,6 +48,19 @@ def test_a_scaled_layer_offset_moves_all_times(case: Case, written: dict[str, An
     for how in case.retimings:
         moved = read_case(retimed(composed, how))
         assert moved["edits"] == read_case(flat)["edits"]
+
+
+def test_no_case_passes_by_what_the_sequence_says_alone(case: Case, written: dict[str, Any]) -> None:
+    composed = written[case.name][0]
+    alone = composed | {"root": composed["root"].replace("shot.usda", "sequence.usda"), "session": "", "muted": []}
+    if case.muted:
+        alone = composed | {"muted": []}
+    wanted = read_case(composed)
+    try:
+        read = read_case(alone)
+    except SidecarError:
+        return
+    assert (read["edits"], read["enabled"]) != (wanted["edits"], wanted["enabled"])
 
 
 def test_the_layer_of_each_value_is_told(case: Case, written: dict[str, Any]) -> None:

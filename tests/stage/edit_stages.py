@@ -63,12 +63,13 @@ class RecordingReader:
 
 
 def stock_findings(stage: Usd.Stage) -> list[str] | None:
-    """Errors of all validators that come with USD; None where this USD cannot load its validators."""
+    """Errors of all validators that come with USD, not of ours; None where this USD cannot load its validators."""
     if Usd.GetVersion() < (0, 26, 5):
         return None
     from pxr import UsdValidation
 
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    validators = [validator for validator in every if not validator.GetMetadata().name.startswith("icheat")]
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
     return [f"{error.GetName()}: {error.GetMessage()}" for error in errors]
 
