@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from icheat_usd.stage import _announce  # noqa: F401  before USD loads
 from icheat_usd.stage.opening import open_stage
 
 if TYPE_CHECKING:

@@ -116,21 +116,27 @@ sys.exit(0)
 """
 
 
-@pytest.fixture
-def installed(tmp_path: Path) -> dict[str, str]:
-    """Environment in which the package is installed, its schema included."""
-    site = tmp_path / "site"
-    info = site / "their_light-1.2.dist-info"
-    info.mkdir(parents=True)
+@pytest.fixture(params=["entry point", "search path"])
+def installed(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
+    """Environment in which their package is installed, and USD finds its schema one way or the other."""
+    package, plugin = tmp_path / "site" / "their_light", tmp_path / "plugin"
+    info = tmp_path / "site" / "their_light-1.2.dist-info"
+    for folder in (package, plugin, info):
+        folder.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-light\nVersion: 1.2\n")
-    (info / "entry_points.txt").write_text("[icheat_usd.operations]\ntheirs = their_light:Theirs\n")
-    (site / "their_light.py").write_text(CODE)
-    plugin = tmp_path / "plugin"
-    plugin.mkdir()
+    entry_points = "[icheat_usd.operations]\ntheirs = their_light:Theirs\n"
+    root = str(Path(operations.__file__).parents[3])
+    environment = {"PYTHONPATH": os.pathsep.join([str(package.parent), root]), "PXR_PLUGINPATH_NAME": ""}
+    if request.param == "entry point":
+        plugin = package
+        entry_points += "[icheat_usd.schemas]\ntheirs = their_light\n"
+    else:
+        environment["PXR_PLUGINPATH_NAME"] = str(plugin)
+    (info / "entry_points.txt").write_text(entry_points)
+    (package / "__init__.py").write_text(CODE)
     (plugin / "plugInfo.json").write_text(PLUG_INFO)
     (plugin / "generatedSchema.usda").write_text(SCHEMA)
-    root = str(Path(operations.__file__).parents[3])
-    return {"PYTHONPATH": os.pathsep.join([str(site), root]), "PXR_PLUGINPATH_NAME": str(plugin)}
+    return environment
 
 
 def icheat(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -151,6 +157,18 @@ def test_their_operation_is_authored_read_and_evaluated(tmp_path: Path, installe
 
     apart, *scale = map(float, python(EVALUATE, str(stage), environment=installed).split())
     assert scale == pytest.approx([1 / (1 + (apart / 2) ** 2)] * 3)
+
+
+def test_hosts_are_told_where_their_schema_lies(installed: dict[str, str]) -> None:
+    told = python("from icheat_usd.plugin_path import main; main()", environment=installed)
+    assert ("their_light" in told) == (installed["PXR_PLUGINPATH_NAME"] == "")
+
+
+def test_their_schema_is_found_where_usd_was_imported_before(installed: dict[str, str]) -> None:
+    code = (
+        "from pxr import Usd, Plug; Plug.Registry(); from icheat_usd.stage import schema; print(*schema.operations())"
+    )
+    assert "theirs" in python(code, environment=installed).split()
 
 
 def test_without_their_package_the_edit_is_one_clear_error(tmp_path: Path, installed: dict[str, str]) -> None:

@@ -7,9 +7,12 @@ point, so that installing the package suffices::
     [project.entry-points."icheat_usd.operations"]
     theirs = "their_package:Theirs"  # the operation's name; a subclass of Operation
 
-It is loaded when an edit first asks for it. Its applied schema holds its
-parameters as ``icheat:theirs:<parameter>`` and is found by USD as any plug-in
-(PXR_PLUGINPATH_NAME).
+    [project.entry-points."icheat_usd.schemas"]
+    theirs = "their_package"  # has plugInfo.json and generatedSchema.usda beside its code
+
+It is loaded when an edit first asks for it. Its applied schema, which holds
+its parameters as ``icheat:theirs:<parameter>``, may also be found by USD as
+any plug-in (PXR_PLUGINPATH_NAME).
 """
 
 from __future__ import annotations
