@@ -25,6 +25,7 @@ VERBS = (
     "tree",
     "cat",
     "diff",
+    "explain",
     "stats",
     "check",
     "plugin_path",
