@@ -144,7 +144,7 @@ class EditField:
     def uses_incident(self) -> bool:
         """True if S depends on the colour of the light, so that a renderer must supply it."""
         return any(
-            bound.level is Level.PAIR and bound.operation is not None and bound.operation.uses_incident
+            bound.level is Level.AGGREGATE or (bound.operation is not None and bound.operation.uses_incident)
             for bound in self.edits
         )
 

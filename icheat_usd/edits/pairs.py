@@ -22,7 +22,7 @@ class PairLight(NamedTuple):
     casters: Ends  #: of the n pairs
     seen: F32  #: (G, n, 3) radiance that leaves the casters, as the edits look at it
     brought: F32  #: (G, n, 3) radiance that arrives: transport times what leaves
-    emitted: F32  #: (n, 3) transport, on which added emission travels
+    emitted: F32  #: (n, 3) transport, on which added emission travels; `brought` is this times `seen`, but for noise
     through: int | None = None  #: slot of `EditField.throughs` whose occluders hold this light back
 
 
@@ -84,11 +84,11 @@ def edited_light(
             for part in _parts(block):
                 here = [np.take(scale, part.owner, axis=0) for scale in resolved]
                 coefficients = field.evaluate(part.seen, receivers.take(part.owner), part.casters, here, upto)
-                brought = arriving(
-                    field, coefficients, part.brought, part.emitted, part.casters, part.through, aggregate
-                )
-                if brought is not None:
-                    light += _sum_by(part.owner, brought, n)
+                # Curves must not see more noise than they have to: they would turn it into bias.
+                arrives = part.brought if aggregate is None else part.emitted * part.seen
+                edited = arriving(field, coefficients, arrives, part.emitted, part.casters, part.through, aggregate)
+                if edited is not None:
+                    light += _sum_by(part.owner, edited, n)
         result: F32 = light.astype(np.float32)
         if offsets is not None and albedo is not None:
             result += offset_radiance(field, offsets, receivers, albedo, resolved, upto, aggregate)

@@ -4,7 +4,9 @@ The plain version: no cache, no photon map, no denoiser. Slow and unbiased,
 apart from the limits below; what is faster is measured against it.
 
 Limits: all reflections before the last are diffuse; caustics through glass are
-left out of the lighting, as shadow rays pass straight through it.
+left out of the lighting, as shadow rays pass straight through it. What curves
+make of a receiver's light is found from the gather rays of one camera sample;
+the noise of few rays is bent by a steep curve, so such edits want many rays.
 """
 
 from __future__ import annotations
@@ -84,8 +86,8 @@ def final_gather(
     gather, gather_radiance : GatherSamples and (n_lights, n_gather, 3) float32, optional
         The gather-sample solution of the relighter, per light. Needed by
         operations that depend on the colour of the light, whose ratio must not
-        be formed from single noisy rays, and by offsets, which are integrated
-        over area.
+        be formed from single noisy rays, by curves, and by offsets, which are
+        integrated over area.
 
     Raises
     ------

@@ -49,6 +49,8 @@ def group_receivers(field: EditField, view: ViewSamples) -> Receivers:
     everywhere = field.receivers(view.points)
     samples = np.flatnonzero((everywhere.masks > 0).any(axis=0))
     ends = everywhere.take(samples)
+    if len(samples) == 0:
+        return Receivers(samples, ends, (), samples)
     # What touches views is applied at the very end.
     acts = np.array([bound.level is not Level.VIEW for bound in field.edits], np.bool_)
     row_edit = np.repeat(np.arange(len(field.edits)), [bound.n_keys for bound in field.edits])
