@@ -16,7 +16,7 @@ from icheat_usd.scene import F32, F64, I64, Bool, SceneSnapshot
 COARSEST = 32
 #: A site speaks for its surroundings as far as the samples that it is nearest to, and half of that again.
 _MARGIN = 1.5
-_PASSES_AT_FINEST = 10
+_PASSES_BY_SAMPLE = 2
 
 
 class ChosenSites(NamedTuple):
@@ -71,15 +71,17 @@ def choose_sites(
         reach, error = _judge(position, normal, group, chosen, footprint[some], values)
         failing = error > 1
         progress("choose rows", 1 - spacing / (COARSEST + 1))
-        if not failing.any() or (spacing == 1 and (passes >= _PASSES_AT_FINEST or not (failing & ~chosen).any())):
+        left = failing & ~chosen
+        if not failing.any() or (spacing == 1 and not left.any()):
             break
         if spacing > 1:
             block = _blocks(x, y, side, spacing, failing)
             spacing //= 2
             chosen |= block & (x % spacing == 0) & (y % spacing == 0)
         else:
+            # A new site takes neighbours from others, which may then fail: blocks grow until all are sites in them.
+            chosen |= left if passes < _PASSES_BY_SAMPLE else _blocks(x, y, side, passes, left)
             passes += 1
-            chosen |= failing
     return ChosenSites(some[chosen], reach[chosen].astype(np.float32), float(error.max()))
 
 
