@@ -17,8 +17,10 @@ class Albedo(Operation):
     Limits: the ratio is held to `division.MAX_RATIO`. What a channel reflects
     with an albedo of 0 is 0, and no ratio makes light of that; such a channel
     stays dark, so a black object cannot be replaced ('emit' can light it).
-    Light that a caster hands on by its gloss is scaled along. Only the last
-    bounce sees the other colour.
+    Light that a caster hands on by its gloss is scaled along. A renderer that
+    gathers from cells takes one point's reflectance for its cell, so what is
+    replaced should not have a texture finer than these. Only the last bounce
+    sees the other colour.
     """
 
     name = "albedo"
