@@ -12,6 +12,7 @@ from icheat_usd.stage.check import RULES, check_stage
 from icheat_usd.stage.description import EditDescription, describe_edit
 from icheat_usd.stage.list_edits import Listing, listings
 from icheat_usd.stage.opening import composition_findings
+from icheat_usd.stage.refusals import named_refusals
 from icheat_usd.stage.stacks import find_stack, stack_prim, stack_prims
 
 
@@ -27,11 +28,13 @@ class StackDescription:
     removed: tuple[Listing, ...] = ()  #: what one layer lists and a stronger one takes out
 
 
+@named_refusals
 def describe_stacks(stage: Any, frame: float | None = None) -> tuple[StackDescription, ...]:
     """Every stack on the stage, in order of traversal."""
     return tuple(describe_stack(stage, str(prim.GetPath()), frame) for prim in stack_prims(stage))
 
 
+@named_refusals
 def describe_stack(stage: Any, path: str, frame: float | None = None) -> StackDescription:
     """One stack at a time.
 

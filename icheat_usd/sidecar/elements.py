@@ -8,10 +8,11 @@ from typing import Any
 
 from icheat_usd.edits.model import Payload
 from icheat_usd.errors import SidecarError
-from icheat_usd.sidecar import mask_elements, recipe_elements  # noqa: F401  (they register themselves)
+from icheat_usd.sidecar import mask_elements, recipe_elements, row_elements  # noqa: F401  (they register themselves)
 from icheat_usd.sidecar.canonical import Element, digest_of
 from icheat_usd.sidecar.mask_elements import check_anchor
 from icheat_usd.sidecar.registry import SLOTS, check_known, decoded, upgraded, written
+from icheat_usd.sidecar.values import shown
 
 
 def payload_digest(payload: Payload, *, anchor: str) -> str:
@@ -58,7 +59,7 @@ def decode_payload(elements: Mapping[str, Element], *, anchor: str, where: str) 
                 "restore the file from a copy"
             ) from problem
         except SidecarError as problem:
-            raise SidecarError(f"{where}: element '{name}': {problem}") from problem
+            raise SidecarError(f"{where}: element '{name}': {shown(str(problem), 400)}") from problem
     if "operation" not in values:
         raise SidecarError(f"{where}: the payload has no element 'recipe'; restore the file from a copy")
     operation, parameters = values.pop("operation")

@@ -23,6 +23,7 @@ import numpy as np
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar.canonical import Array, Element, alias_check, digest_of, kind_of
 from icheat_usd.sidecar.registry import check_known
+from icheat_usd.sidecar.values import shown
 
 FORMAT = "icheat-sidecar"
 FORMAT_VERSION = 1
@@ -325,11 +326,6 @@ def file_name(file: Source, name: str | None) -> str:
     if name is not None:
         return name
     return os.fspath(file) if isinstance(file, (str, os.PathLike)) else "sidecar in memory"
-
-
-def shown(text: str) -> str:
-    """Text from a file as one line of a message or a terminal may show it: no control characters."""
-    return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text[:200])
 
 
 def _brief(problem: BaseException) -> str:

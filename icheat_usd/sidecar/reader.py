@@ -24,8 +24,8 @@ from icheat_usd.sidecar.guarded import (
     payload_names,
     read_dataset,
     read_elements,
-    shown,
 )
+from icheat_usd.sidecar.values import shown
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from icheat_usd.edits.model import Payload
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar.canonical import Element
+from icheat_usd.sidecar.values import shown
 
 
 class Slot(NamedTuple):
@@ -89,8 +90,8 @@ def check_known(name: str, type_: str, version: int, where: str) -> None:
     """
     if name in SLOTS and (type_ != SLOTS[name].type or version > newest_version(type_)):
         raise SidecarError(
-            f"{where}: element '{name}' is {type_} version {version}, and this icheat_usd reads {SLOTS[name].type} "
-            f"up to version {newest_version(SLOTS[name].type)}; update icheat_usd"
+            f"{where}: element '{name}' is {shown(type_)} version {version}, and this icheat_usd reads "
+            f"{SLOTS[name].type} up to version {newest_version(SLOTS[name].type)}; update icheat_usd"
         )
 
 

@@ -12,6 +12,11 @@ from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar.canonical import Array, Element
 
 
+def shown(text: str, limit: int = 200) -> str:
+    """Text from a file as one line of a message or a terminal may show it: no control characters."""
+    return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text[:limit])
+
+
 def floats(value: Any, what: str) -> NDArray[np.float64]:
     """One number or several, finite, as a list."""
     try:

@@ -132,7 +132,7 @@ def _write_dataset(group: h5py.Group, path: str, array: Array) -> None:
         # HDF5 converts no ASCII to UTF-8 strings: the array itself has to say that it is UTF-8.
         array = array.astype(h5py.string_dtype("utf-8", max(1, array.dtype.itemsize)))
     options: dict[str, Any] = {}
-    if array.nbytes >= _FILTER_FROM_BYTES:
+    if array.ndim and array.nbytes >= _FILTER_FROM_BYTES:
         options = {"chunks": _chunks(array), "compression": "gzip", "compression_opts": 1}
         options |= {"shuffle": True, "fletcher32": True}
     group.create_dataset(path, data=np.ascontiguousarray(array) if array.ndim else array, **options)

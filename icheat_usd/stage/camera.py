@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,12 +49,27 @@ def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode) -> RenderChoices:
     purposes = first("materialBindingPurposes", ["full", ""])
     return RenderChoices(
         camera=cameras[0] if cameras else None,
-        resolution=None if resolution is None else (int(resolution[0]), int(resolution[1])),  # type: ignore[index]
-        pixel_aspect=float(first("pixelAspectRatio", 1.0)),  # type: ignore[arg-type]
+        resolution=None if resolution is None else _pixels(settings, resolution),
+        pixel_aspect=_number(settings, first("pixelAspectRatio", 1.0)),
         conform=str(first("aspectRatioConformPolicy", "expandAperture")),
         depth_of_field=not first("disableDepthOfField", False),
         material_purpose=next((str(purpose) for purpose in purposes if purpose), ""),  # type: ignore[attr-defined]
     )
+
+
+def _pixels(settings: UsdRender.Settings, resolution: object) -> tuple[int, int]:
+    try:
+        width, height = (int(size) for size in resolution)  # type: ignore[attr-defined]
+        return width, height
+    except (TypeError, ValueError) as problem:
+        raise StageError(f"{settings.GetPath()}: resolution is no int2; author a width and a height.") from problem
+
+
+def _number(settings: UsdRender.Settings, value: object) -> float:
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError) as problem:
+        raise StageError(f"{settings.GetPath()}: pixelAspectRatio is no number; author one above 0.") from problem
 
 
 def find_camera(stage: Usd.Stage, camera: str | None, choices: RenderChoices) -> UsdGeom.Camera:
@@ -105,7 +121,8 @@ def image_size(
         if choices.resolution is not None and min(choices.resolution) >= 1:
             return choices.resolution
         return DEFAULT_WIDTH, max(1, round(DEFAULT_WIDTH / aperture_aspect))
-    aspect = choices.resolution[0] / choices.resolution[1] if choices.resolution else aperture_aspect
+    sizes = choices.resolution if choices.resolution and min(choices.resolution) >= 1 else None
+    aspect = sizes[0] / sizes[1] if sizes else aperture_aspect
     if width is None:
         assert height is not None
         return max(1, round(height * aspect)), height
@@ -122,6 +139,11 @@ def conform(window: tuple[float, float, float, float], aspect: float, policy: st
     """
     left, right, bottom, top = window
     wide, high = right - left, top - bottom
+    if not (0.0 < aspect < math.inf and 0.0 < wide < math.inf and 0.0 < high < math.inf):
+        raise StageError(
+            f"The camera's window is {wide:g} x {high:g} and the image's aspect {aspect:g}; "
+            "give apertures, pixelAspectRatio and resolution positive numbers."
+        )
     is_wider = aspect > wide / high
     if policy == "adjustPixelAspectRatio":
         return window

@@ -23,6 +23,7 @@ from icheat_usd.stage.parameters import (
     read_number,
     read_parameters,
 )
+from icheat_usd.stage.refusals import named_refusals
 from icheat_usd.stage.selections import limit_content, with_limits
 from icheat_usd.stage.spaces import in_scene_space
 from icheat_usd.stage.stacks import EditFinding, listed_edits, stack_prim, targets
@@ -49,6 +50,7 @@ class PayloadReader(Protocol):
         """
 
 
+@named_refusals
 def read_edit_stack(
     stage: Usd.Stage,
     stack_path: str,

@@ -12,6 +12,7 @@ from icheat_usd.scene import Finding
 from icheat_usd.stage import schema
 from icheat_usd.stage.edit_stack import anchor_path
 from icheat_usd.stage.keys import read_keys, strongest_opinion
+from icheat_usd.stage.refusals import named_refusals
 from icheat_usd.stage.stacks import EditFinding, Severity, edit_prim
 
 
@@ -26,6 +27,7 @@ class PinnedKey:
     anchor: str
 
 
+@named_refusals
 def pinned_keys(stage: Usd.Stage) -> tuple[tuple[PinnedKey, ...], list[Finding]]:
     """Keys of every active edit prim, and findings for edits whose keys cannot be read."""
     keys: list[PinnedKey] = []
@@ -48,6 +50,7 @@ def edit_keys(prim: Usd.Prim) -> list[PinnedKey]:
     return [PinnedKey(path, key.time, key.digest, key.anchored, anchor) for key in track.keys if key.digest]
 
 
+@named_refusals
 def keys_and_layers(stage: Usd.Stage, edit: str) -> tuple[list[PinnedKey], list[str]]:
     """The keys of the edit at a path, and the files of all layers that say something about its payload.
 

@@ -16,6 +16,7 @@ from icheat_usd.stage.lights import read_lights, read_mesh_factors, with_mesh_li
 from icheat_usd.stage.materials import MaterialLibrary
 from icheat_usd.stage.opening import composition_findings, quiet_usd
 from icheat_usd.stage.placing import GeometryBuilder
+from icheat_usd.stage.refusals import named_refusals
 from icheat_usd.stage.reporting import Reporter
 from icheat_usd.stage.transforms import Placement
 from icheat_usd.stage.walking import walk
@@ -24,6 +25,7 @@ from icheat_usd.stage.walking import walk
 AUTO_CAMERA = "auto"
 
 
+@named_refusals
 def take_snapshot(
     stage: Usd.Stage,
     *,

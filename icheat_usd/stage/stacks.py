@@ -10,6 +10,7 @@ from pxr import Sdf, Usd
 from icheat_usd.errors import EditError
 from icheat_usd.scene import Finding
 from icheat_usd.stage import schema
+from icheat_usd.stage.refusals import named_refusals
 
 
 class Severity(StrEnum):
@@ -33,6 +34,7 @@ def stack_prims(stage: Usd.Stage) -> list[Usd.Prim]:
     return [prim for prim in everything if schema.has_schema(prim, schema.STACK_API)]
 
 
+@named_refusals
 def find_stack(stage: Usd.Stage, stack: str | None = None, camera: str | None = None) -> str | None:
     """Path of the stack to use: the named one, else that of the render settings, else the camera's only one.
 

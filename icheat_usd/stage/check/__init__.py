@@ -12,6 +12,7 @@ from icheat_usd.stage.check import baked, edits, keys, schemas, selections, stac
 from icheat_usd.stage.check.rule import Context, Rule, look_at
 from icheat_usd.stage.edit_stack import PayloadReader
 from icheat_usd.stage.opening import quiet_usd
+from icheat_usd.stage.refusals import named_refusals
 from icheat_usd.stage.stacks import EditFinding
 
 __all__ = ["RULES", "Context", "Rule", "check_stage", "findings_of"]
@@ -45,6 +46,7 @@ RULES: tuple[Rule, ...] = (
     keys.FileWithoutPayload(),
     keys.KeysFromTwoLayers(),
     keys.KeyTimesDiffer(),
+    keys.KeysFromClips(),
     keys.MissingSidecar(),
     keys.UnanchoredFile(),
     keys.CopiedKeysOutdated(),
@@ -55,6 +57,7 @@ RULES: tuple[Rule, ...] = (
 )
 
 
+@named_refusals
 def check_stage(
     stage: Usd.Stage, time: float | None = None, read_payload: PayloadReader | None = None
 ) -> list[EditFinding]:
