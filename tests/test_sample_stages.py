@@ -15,11 +15,13 @@ pytest.importorskip("pxr")
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdRender  # noqa: E402
 
+from icheat_usd.edits import operations  # noqa: E402
 from icheat_usd.session import Quality, Session, inspection  # noqa: E402
 
 REPOSITORY = Path(__file__).parents[1]
 STAGES = REPOSITORY / "sample_stages"
 NAMES = ("animated_room", "cornell_box", "furnished_room", "glossy_set", "staircase")
+OPERATIONS = sorted(path.stem for path in (STAGES / "operations").glob("*.usda"))
 
 
 def test_every_committed_file_is_what_the_tool_writes() -> None:
@@ -30,20 +32,22 @@ def test_every_committed_file_is_what_the_tool_writes() -> None:
 
 
 def test_the_folder_holds_the_stages_and_none_is_large() -> None:
-    assert sorted(path.name for path in STAGES.iterdir()) == sorted(NAMES)
+    assert sorted(path.name for path in STAGES.iterdir()) == sorted((*NAMES, "operations"))
     sizes = {path: path.stat().st_size for path in STAGES.rglob("*") if path.is_file()}
     assert max(sizes.values()) < 300_000 and sum(sizes.values()) < 1_000_000
 
 
-@pytest.mark.parametrize("layer", ["scene", "sequence", "shot"])
-@pytest.mark.parametrize("name", NAMES)
-def test_usd_finds_nothing_wrong(name: str, layer: str) -> None:
+LAYERS = [f"{name}/{layer}" for name in NAMES for layer in ("scene", "sequence", "shot")]
+
+
+@pytest.mark.parametrize("layer", [*LAYERS, *(f"operations/{name}" for name in OPERATIONS)])
+def test_usd_finds_nothing_wrong(layer: str) -> None:
     validation = pytest.importorskip("pxr.UsdValidation", reason="usd-core before 25.2 has no validators")
     try:
         validators = validation.ValidationRegistry().GetOrLoadAllValidators()
     except Tf.ErrorException:
         pytest.skip("the wheels of usd-core 25.5 name validators whose libraries they lack")
-    stage = Usd.Stage.Open(str(STAGES / name / f"{layer}.usda"))
+    stage = Usd.Stage.Open(str(STAGES / f"{layer}.usda"))
     errors = validation.ValidationContext(validators).Validate(stage)
     assert [f"{error.GetName()}: {error.GetMessage()}" for error in errors] == []
 
@@ -70,6 +74,17 @@ def test_the_shot_overrides_an_edit_of_the_sequence_and_adds_its_own(name: str) 
     assert len(composed) > len(weaker)
     assert any(edit.amount.value != before.amount.value for edit, before in zip(composed, weaker, strict=False))
     assert inspection.check(shot) == ()
+
+
+def test_every_operation_has_a_stage_of_its_own() -> None:
+    shown = {}
+    for name in OPERATIONS:
+        stage = inspection.open_stage(STAGES / "operations" / f"{name}.usda")
+        (edit,) = inspection.describe_stack(stage, "/World/Edits").edits
+        shown[name] = edit.operation.value
+        assert inspection.check(stage) == ()
+    assert set(shown.values()) == set(operations.names())
+    assert all(name == operation for name, operation in shown.items() if name in operations.names())
 
 
 def luminance(pixels: NDArray[np.float32]) -> float:
@@ -102,4 +117,22 @@ def test_the_documentation_states_the_light_that_is_there(name: str) -> None:
     assert unedited == pytest.approx(float(mean), rel=0.05)
     assert 100 * indirect / unedited == pytest.approx(float(share), abs=3)
     assert 100 * luminance(layers["edit_delta"]) / indirect == pytest.approx(float(change), abs=0.3, rel=0.1)
+    assert session.findings == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_an_operation_changes_the_light_as_its_documentation_states(name: str) -> None:
+    documentation = Sdf.Layer.FindOrOpen(str(STAGES / "operations" / f"{name}.usda")).documentation
+    found = re.search(r"Expect at 160 x 120: the edit changes the indirect light by ([-+][\d.]+) %\.$", documentation)
+    assert found, documentation
+    session = Session.open(
+        STAGES / "operations" / f"{name}.usda",
+        width=80,
+        height=60,
+        quality=Quality(n_gather=8192, rays_per_row=64, rays_per_bounce_row=64, light_samples=8),
+    )
+    layers = session.relight().layers
+    change = 100 * luminance(layers["edit_delta"]) / luminance(layers["indirect"])
+    assert change == pytest.approx(float(found[1]), abs=0.3, rel=0.08)
     assert session.findings == ()

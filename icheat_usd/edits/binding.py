@@ -25,14 +25,14 @@ def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
     ------
     EditError
         An operation is unknown and no payload holds it baked, a parameter is
-        wrong, a light or an occluder does not exist, or a painted mask cannot
+        wrong, an occluder does not exist, or a painted mask cannot
         be placed on the scene.
     """
     group, members = _light_groups(stack, snapshot)
     bound = [_bind_edit(edit, snapshot, members.get(edit.path)) for edit in stack.active]
     n_groups = int(group.max(initial=0)) + 1
-    # An edit that is blocked at this time has no key left: the identity.
-    edits = tuple(edit for edit in bound if edit.n_keys)
+    # An edit that is blocked at this time has no key left, and one whose lights are all out nothing to scale.
+    edits = tuple(edit for edit in bound if edit.n_keys and (edit.groups.any() or not len(edit.groups)))
     edits = tuple(_with_groups(edit, n_groups) for edit in edits)
     return EditField(edits, group, n_groups, _findings(edits))
 
@@ -48,13 +48,9 @@ def _light_groups(stack: EditStack, snapshot: SceneSnapshot) -> tuple[I64, dict[
 
 
 def _named_lights(edit: Edit, snapshot: SceneSnapshot) -> Bool:
-    wanted = edit.lights
-    below = tuple(path + "/" for path in wanted)
-    found = np.array([path in wanted or path.startswith(below) for path in snapshot.light_paths], np.bool_)
-    if not found.any():
-        known = ", ".join(snapshot.light_paths[:8]) or "none"
-        raise EditError(f"{edit.path}: {', '.join(wanted)} is no light of this scene; its lights: {known}")
-    return found
+    """Which lights are at or below the edit's; none, if what it names is hidden or sends nothing at this time."""
+    below = tuple(path.rstrip("/") + "/" for path in edit.lights)
+    return np.array([path in edit.lights or path.startswith(below) for path in snapshot.light_paths], np.bool_)
 
 
 def _with_groups(bound: BoundEdit, n_groups: int) -> BoundEdit:
