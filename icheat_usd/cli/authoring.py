@@ -19,18 +19,22 @@ def open_for_writing(options: argparse.Namespace) -> tuple[Any, str]:
 def named_edit(stage: Any, options: argparse.Namespace) -> tuple[str, str]:
     """Paths of the stack and of the edit that the command line names, the latter by path or by name.
 
+    With --variant the edit may be one that only that variant has.
+
     Raises
     ------
     EditError
-        The stage has no such stack, or the stack no such edit.
+        The stage has no such stack, or the stack no such edit or variant.
     """
     from icheat_usd.session import inspection
+    from icheat_usd.stage.variants import selected_variant
 
     path = inspection.find_stack(stage, options.stack, options.camera)
     if path is None:
         raise EditError(f"{options.stage} has no edit stack; make one with `icheat stack create`")
-    stack = inspection.describe_stack(stage, path)
-    paths = [edit.path for edit in stack.edits]
+    guess = options.edit if options.edit.startswith("/") else f"{path}/{options.edit}"
+    with selected_variant(stage, guess, getattr(options, "variant", None)):
+        paths = [edit.path for edit in inspection.describe_stack(stage, path).edits]
     found = [p for p in paths if p == options.edit] or [p for p in paths if p.rpartition("/")[2] == options.edit]
     if len(found) != 1:
         raise EditError(f"{path} has no edit '{options.edit}'; it has {', '.join(paths) or 'no edits'}")

@@ -18,6 +18,7 @@ from icheat_usd.cli.options import (
     add_layer,
     add_stack,
     add_stage,
+    add_variant,
     add_why,
     assignment,
     finding_as_json,
@@ -78,6 +79,7 @@ def _verb(
     parser.add_argument("--camera", metavar="PRIM", help="camera whose stack is meant")
     if writes:
         add_layer(parser)
+        add_variant(parser)
     if name in ("add", "set", "list"):
         add_frame(parser)
     add_json(parser)
@@ -149,7 +151,7 @@ def add_command(options: argparse.Namespace) -> int:
     if options.sidecar is not None:
         values["sidecar"] = options.sidecar
     values |= {"layer": layer, "parameters": dict(options.set or ()), "frame": options.frame}
-    values |= {"before": options.before, "after": options.after, "why": why(options)}
+    values |= {"before": options.before, "after": options.after, "why": why(options), "variant": options.variant}
     spheres = {side: getattr(options, f"{side}_sphere") for side in ("receiver", "caster")}
     if any(spheres.values()):
         # Painting needs the scene; an edit between whole prims does not, and works in a host without the kernels.
@@ -205,6 +207,7 @@ def set_command(options: argparse.Namespace) -> int:
     _, edit = named_edit(stage, options)
     values: dict[str, Any] = {"operation": options.operation, "amount": options.amount, "blend": options.blend}
     values |= {"parameters": dict(options.set) if options.set else None, "time": options.frame}
+    values["variant"] = options.variant
     values |= _related(options)
     for side in ("receivers", "casters"):
         values[side] = _members(options, side)
@@ -217,7 +220,8 @@ def mute_command(options: argparse.Namespace) -> int:
 
     stage, layer = open_for_writing(options)
     _, edit = named_edit(stage, options)
-    return _report(options, edit, layer, authoring.mute_edit(stage, edit, layer=layer, muted=not options.off))
+    findings = authoring.mute_edit(stage, edit, layer=layer, muted=not options.off, variant=options.variant)
+    return _report(options, edit, layer, findings)
 
 
 def move_command(options: argparse.Namespace) -> int:
@@ -226,7 +230,8 @@ def move_command(options: argparse.Namespace) -> int:
 
     stage, layer = open_for_writing(options)
     stack, edit = named_edit(stage, options)
-    authoring.move_edit(stage, stack, edit, layer=layer, before=options.before, after=options.after)
+    place = {"before": options.before, "after": options.after, "variant": options.variant}
+    authoring.move_edit(stage, stack, edit, layer=layer, **place)
     return _report(options, edit, layer, ())
 
 
@@ -236,7 +241,7 @@ def remove_command(options: argparse.Namespace) -> int:
 
     stage, layer = open_for_writing(options)
     stack, edit = named_edit(stage, options)
-    authoring.remove_edit(stage, stack, edit, layer=layer)
+    authoring.remove_edit(stage, stack, edit, layer=layer, variant=options.variant)
     return _report(options, edit, layer, ())
 
 

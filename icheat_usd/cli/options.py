@@ -32,6 +32,23 @@ def add_layer(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_variant(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--variant",
+        type=variant,
+        metavar="SET=VARIANT",
+        help="write into this variant of the stack's prim, or of the edit's own, such as grade=dusk",
+    )
+
+
+def variant(text: str) -> tuple[str, str]:
+    """`set=variant` of --variant."""
+    name, _, chosen = text.partition("=")
+    if not name or not chosen:
+        raise argparse.ArgumentTypeError(f"'{text}' is no SET=VARIANT, such as grade=dusk")
+    return name, chosen
+
+
 def add_why(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--why", metavar="TEXT", help="kept in the payload's history; default the command line")
 

@@ -71,6 +71,7 @@ def add_edit(
     frame: float | None = None,
     before: str | None = None,
     after: str | None = None,
+    variant: tuple[str, str] | None = None,
     sidecar: str | Path | None = None,
     why: str = "",
 ) -> str:
@@ -82,6 +83,8 @@ def add_edit(
         None makes one, ``<default prim>/Edits``.
     receivers, casters, receiver_limits, caster_limits, occluders, lights, target
         What the edit is about; see `stage.authoring.add_edit`.
+    variant : (str, str), optional
+        Variant set and variant to write into, such as ("grade", "dusk") of the stack's prim.
     sidecar : path, optional
         Folder or file for the payload; beside the layer's file by default. Needed for layers without a file.
     why : str
@@ -137,6 +140,7 @@ def add_edit(
                 time=frame,
                 before=before,
                 after=after,
+                variant=variant,
             )
             _save(stage, layer)
     except Exception:
@@ -154,22 +158,22 @@ def set_edit(stage: Any, edit: str, *, layer: str, **values: Any) -> tuple[Findi
     return findings
 
 
-def mute_edit(stage: Any, edit: str, *, layer: str, muted: bool = True) -> tuple[Finding, ...]:
+def mute_edit(
+    stage: Any, edit: str, *, layer: str, muted: bool = True, variant: tuple[str, str] | None = None
+) -> tuple[Finding, ...]:
     """Mute or unmute an edit in one layer and save it."""
-    return set_edit(stage, edit, layer=layer, enabled=not muted)
+    return set_edit(stage, edit, layer=layer, enabled=not muted, variant=variant)
 
 
-def move_edit(
-    stage: Any, stack: str, edit: str, *, layer: str, before: str | None = None, after: str | None = None
-) -> None:
+def move_edit(stage: Any, stack: str, edit: str, *, layer: str, **place: Any) -> None:
     """Move an edit within its stack and save the layer; see `stage.authoring.move_edit`."""
-    authoring.move_edit(stage, stack, edit, layer=layer, before=before, after=after)
+    authoring.move_edit(stage, stack, edit, layer=layer, **place)
     _save(stage, layer)
 
 
-def remove_edit(stage: Any, stack: str, edit: str, *, layer: str) -> None:
+def remove_edit(stage: Any, stack: str, edit: str, *, layer: str, variant: tuple[str, str] | None = None) -> None:
     """Take an edit out of a stack and save the layer; see `stage.authoring.remove_edit`."""
-    authoring.remove_edit(stage, stack, edit, layer=layer)
+    authoring.remove_edit(stage, stack, edit, layer=layer, variant=variant)
     _save(stage, layer)
 
 

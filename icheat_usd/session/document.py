@@ -279,6 +279,7 @@ class Session:
         frame: float | None = None,
         before: str | None = None,
         after: str | None = None,
+        variant: tuple[str, str] | None = None,
         sidecar: str | Path | None = None,
         why: str = "",
     ) -> str:
@@ -300,6 +301,8 @@ class Session:
             Soft weights by position, painted on the selected surfaces; see `edits.painting`.
         frame : float, optional
             Time of the key; without it the edit holds at all times.
+        variant : (str, str), optional
+            Variant set and variant to write into, such as ("grade", "dusk") of the stack's prim.
         sidecar : path, optional
             Folder or file for the payload; beside the layer's file by default.
         why : str
@@ -337,6 +340,7 @@ class Session:
             frame=frame,
             before=before,
             after=after,
+            variant=variant,
             sidecar=sidecar,
             why=why,
         )
@@ -389,6 +393,8 @@ class Session:
         """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`."""
         return authoring.set_edit(self.stage, edit, layer=layer, **values)
 
-    def mute_edit(self, edit: str, *, layer: str, muted: bool = True) -> tuple[Finding, ...]:
+    def mute_edit(
+        self, edit: str, *, layer: str, muted: bool = True, variant: tuple[str, str] | None = None
+    ) -> tuple[Finding, ...]:
         """Mute or unmute an edit in one layer and save it."""
-        return authoring.set_edit(self.stage, edit, layer=layer, enabled=not muted)
+        return authoring.mute_edit(self.stage, edit, layer=layer, muted=muted, variant=variant)

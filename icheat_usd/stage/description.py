@@ -11,7 +11,7 @@ from pxr import Usd
 from icheat_usd.edits.model import Value
 from icheat_usd.errors import EditError
 from icheat_usd.stage import collections, schema
-from icheat_usd.stage.keys import KeyTrack, read_keys, strongest_opinion
+from icheat_usd.stage.keys import KeyTrack, comes_from_clips, read_keys, strongest_opinion
 from icheat_usd.stage.list_edits import listings
 from icheat_usd.stage.parameters import authored_parameters
 from icheat_usd.stage.stacks import edit_prim, stack_prims, targets
@@ -135,8 +135,7 @@ def _described(prim: Usd.Prim, name: str, time: float | None) -> Described:
         value = next((p.fallback for o in registered.values() for p in o.parameters.values() if p.name == name), None)
     converted = None if value is None else schema.to_value(value)
     shown = "" if converted is None else converted
-    if attribute and attribute.GetResolveInfo(schema.time_code(time)).GetSource() == Usd.ResolveInfoSourceValueClips:
-        return Described(shown, "", "valueClips")
     if opinion is None:
         return Described(shown, "")
-    return Described(shown, opinion.layer.identifier, "block" if opinion.is_blocked else opinion.source)
+    source = "valueClips" if comes_from_clips(attribute, time) else opinion.source
+    return Described(shown, opinion.layer.identifier, "block" if opinion.is_blocked else source)

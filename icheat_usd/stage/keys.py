@@ -94,7 +94,7 @@ class KeyTrack:
 def strongest_opinion(attribute: Usd.Attribute, time: float | None = None) -> Opinion | None:
     """The spec that decides the attribute's value at a time, None where nothing is authored.
 
-    Value clips have no spec of their own, and are not seen here.
+    Of value clips that decide, the layer is the clip's, at the clip's times.
     """
     if not attribute:
         return None
@@ -108,6 +108,12 @@ def strongest_opinion(attribute: Usd.Attribute, time: float | None = None) -> Op
     return None
 
 
+def comes_from_clips(attribute: Usd.Attribute, time: float | None = None) -> bool:
+    """Whether value clips decide the attribute's value at a time."""
+    source = attribute.GetResolveInfo(schema.time_code(time)).GetSource() if attribute else None
+    return bool(source == Usd.ResolveInfoSourceValueClips)
+
+
 def read_keys(prim: Usd.Prim) -> KeyTrack | None:
     """The composed keys of an edit, None where it has no payload.
 
@@ -119,8 +125,9 @@ def read_keys(prim: Usd.Prim) -> KeyTrack | None:
     """
     payload = prim.GetAttribute(schema.PAYLOAD)
     opinion = strongest_opinion(payload)
-    if payload and payload.GetResolveInfo(schema.time_code(None)).GetSource() == Usd.ResolveInfoSourceValueClips:
-        raise EditError(f"{prim.GetPath()}: {schema.PAYLOAD} comes from value clips; author its keys in a layer")
+    for name in (schema.PAYLOAD, schema.FILE_PATH):
+        if comes_from_clips(prim.GetAttribute(name)):
+            raise EditError(f"{prim.GetPath()}: {name} comes from value clips; author its keys in a layer")
     if opinion is None:
         return None
     interpolation = read_interpolation(prim)

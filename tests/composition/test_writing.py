@@ -13,6 +13,7 @@ from pxr import Usd
 from icheat_usd.errors import EditError
 from icheat_usd.stage import schema
 from icheat_usd.stage.authoring import add_edit, find_layer, move_edit, mute_edit, remove_edit, set_edit
+from icheat_usd.stage.check import check_stage
 from icheat_usd.stage.description import describe_edit
 from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.stage.key_authoring import set_payload_key
@@ -273,10 +274,11 @@ def test_keys_from_value_clips_are_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(EditError, match=r"keyed: icheat:payload comes from value clips; author its keys in a layer"):
         read_edit_stack(stage, STACK, 4, SURFACES)
     assert "value clips" in describe_edit(stage, f"{STACK}/keyed", 4).problem
+    assert ("KeysFromClips", "icheat:payload") in [(found.rule, found.feature) for found in check_stage(stage)]
 
 
 def test_an_amount_from_value_clips_is_read_and_told(tmp_path: Path) -> None:
     stage = clipped(tmp_path, "float icheat:amount", "0.375")
     assert read_edit_stack(stage, STACK, 4, SURFACES)[0].edits[0].amount == 0.375
     told = describe_edit(stage, f"{STACK}/keyed", 4).amount
-    assert (told.value, told.layer, told.source) == (0.375, "", "valueClips")
+    assert (told.value, Path(told.layer).name, told.source) == (0.375, "clip.usda", "valueClips")

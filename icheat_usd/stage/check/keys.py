@@ -7,7 +7,7 @@ from pxr import Sdf
 from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.stage import key_authoring, schema
 from icheat_usd.stage.check.rule import Context, Found, Rule
-from icheat_usd.stage.keys import SAME_TIME, Opinion, read_keys, strongest_opinion
+from icheat_usd.stage.keys import SAME_TIME, Opinion, comes_from_clips, read_keys, strongest_opinion
 from icheat_usd.stage.stacks import Severity
 
 
@@ -65,6 +65,16 @@ class KeyTimesDiffer(Rule):
             same = len(times[0]) == len(times[1])
             if not same or any(abs(a - b) > SAME_TIME for a, b in zip(*times, strict=True)):
                 yield prim, schema.FILE_PATH, f"has other sample times than {schema.PAYLOAD}; sample both together"
+
+
+class KeysFromClips(Rule):
+    doc = "Keys are authored in layers, not in value clips."
+
+    def find(self, context: Context) -> Found:
+        for prim in context.edits:
+            for name in (schema.PAYLOAD, schema.FILE_PATH):
+                if comes_from_clips(prim.GetAttribute(name)):
+                    yield prim, name, "comes from value clips, so the edit cannot be read; author its keys in a layer"
 
 
 class MissingSidecar(Rule):
