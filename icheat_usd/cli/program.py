@@ -20,6 +20,7 @@ VERBS = (
     "stack",
     "edit",
     "key",
+    "bake",
     "region",
     "selection",
     "tree",

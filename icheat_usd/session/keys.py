@@ -171,10 +171,23 @@ def set_interpolation(stage: Any, edit: str, *, layer: str, interpolation: str) 
     return findings
 
 
+def payload_at(
+    stage: Any, edit: str, frame: float | None, made_against: Mapping[str, str | float | int]
+) -> Payload:
+    """What an edit says at a frame as one payload: recipe, with what is authored over it, and masks.
+
+    Raises
+    ------
+    EditError, SidecarError
+        There is no such edit, or its keys cannot be read.
+    """
+    return _Made(stage, edit, frame, {}).payload((None, None), made_against)
+
+
 class _Made:
     """What an edit says around one frame, and the payloads that a key there needs."""
 
-    def __init__(self, stage: Any, edit: str, frame: float, parameters: dict[str, Value]) -> None:
+    def __init__(self, stage: Any, edit: str, frame: float | None, parameters: dict[str, Value]) -> None:
         self.prim = edit_prim(stage, edit)
         self.frame = frame
         self.parameters = parameters
@@ -230,6 +243,7 @@ class _Made:
     def other_payloads(self) -> dict[float, Payload]:
         """By time: payloads of the other keys with the values, so far authored, of parameters that are keyed now."""
         others: dict[float, Payload] = {}
+        assert self.frame is not None
         for key in self._keys if self._newly_keyed else ():
             if not key.digest or key.time is None or abs(key.time - self.frame) <= SAME_TIME:
                 continue
@@ -264,7 +278,7 @@ class _Made:
             for mask, _ in painted
         )
         if heaviest is None or not alike:
-            message = f"the keys around frame {self.frame:g} cover other surfaces; that of the nearer key is taken"
+            message = f"the keys around frame {self.frame or 0.0:g} cover other surfaces; that of the nearer key is taken"
             self.findings.append(EditFinding(str(self.prim.GetPath()), side.replace("_", " "), message))
             return heaviest
         total = sum(weight for _, weight in painted)

@@ -15,7 +15,7 @@ from icheat_usd.edits.encodings.rows import Mixture, bind_rows
 from icheat_usd.edits.encodings.sampled import SampledRows, contract, tree_shape
 from icheat_usd.edits.encodings.sites import choose_sites, pixel_footprint
 from icheat_usd.edits.field import EditField
-from icheat_usd.edits.model import Blend, Edit, EditStack, KeyedPayload
+from icheat_usd.edits.model import Blend, Edit, EditStack
 from icheat_usd.edits.operations import Level
 from icheat_usd.errors import EditError
 from icheat_usd.materials import take_points
@@ -40,10 +40,9 @@ class BakedRows(NamedTuple):
     lost: float  #: most radiance that an aggregate adds where it cannot scale; rows do not hold it
 
 
-def at_full_amount(edit: Edit, key: KeyedPayload | None = None) -> EditStack:
-    """The one edit that is baked: full amount, one key, all lights; amount, blend and lights stay opinions in USD."""
-    keys = () if key is None else (replace(key, weight=1.0),)
-    whole = replace(edit, amount=1.0, enabled=True, blend=Blend.COMPOSE, lights=(), keys=keys)
+def at_full_amount(edit: Edit) -> EditStack:
+    """The one edit that is baked: full amount, all lights; amount, blend and lights stay opinions in USD."""
+    whole = replace(edit, amount=1.0, enabled=True, blend=Blend.COMPOSE, lights=())
     return EditStack(path="", edits=(whole,))
 
 

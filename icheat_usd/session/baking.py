@@ -1,0 +1,434 @@
+"""Baking edits for good: sampled rows in a new sidecar, named by the edit's keys in one layer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from icheat_usd.edits.binding import bind
+from icheat_usd.edits.encodings.bake import (
+    EPSILON,
+    BakedRows,
+    at_full_amount,
+    bake_field,
+    check_bakeable,
+    largest_error,
+)
+from icheat_usd.edits.encodings.choose import choose
+from icheat_usd.edits.encodings.pair_samples import PairSamples
+from icheat_usd.edits.facts import facts
+from icheat_usd.edits.field import EditField
+from icheat_usd.edits.model import Blend, Edit, EditStack, Payload
+from icheat_usd.edits.operations import Level, find
+from icheat_usd.errors import EditError
+from icheat_usd.progress import Progress, silent
+from icheat_usd.scene import Finding
+from icheat_usd.session.document import Session
+from icheat_usd.session.inspection import describe_stack
+from icheat_usd.session.keys import payload_at
+from icheat_usd.session.origin import history_entry
+from icheat_usd.session.quality import PREVIEW, Quality
+from icheat_usd.sidecar import list_elements, write_payloads
+from icheat_usd.stage import authoring, key_authoring, layers
+from icheat_usd.stage.authoring import Members
+from icheat_usd.stage.edit_stack import anchor_path
+from icheat_usd.stage.keys import read_keys
+from icheat_usd.stage.stacks import EditFinding, edit_prim
+
+#: Operation of an edit that is evaluated by what is baked.
+BAKED = "baked"
+
+#: Keys of a frozen stack are put no closer than this, in frames.
+_CLOSEST_KEYS = 1.0
+
+
+@dataclass(frozen=True)
+class BakedKey:
+    """One payload with rows that was written."""
+
+    edit: str
+    time: float | None  #: stage time of the key; None: it holds at all times
+    payload: str  #: digest
+    file: str
+    cheapest: str  #: the cheapest encoding that is exact
+    view_samples: int  #: that the edit touches
+    sites: int  #: places that rows are kept for
+    rows: int  #: different ones among them
+    gather_samples: int  #: that rows have a value for
+    coefficients: int
+    stored_bytes: int  #: of the rows in the file
+    epsilon_scale: float  #: stated bounds, see `SampledRows`
+    epsilon_emission: float
+    epsilon_offset: float
+    measured_error: float  #: of S at random view samples, between rows too
+    lost_radiance: float  #: that an aggregate adds where nothing can be scaled; rows do not hold it
+
+
+@dataclass(frozen=True)
+class Baked:
+    """What `bake_edits` and `flatten_stack` wrote."""
+
+    keys: tuple[BakedKey, ...]
+    findings: tuple[Finding, ...]
+
+
+class Shot(NamedTuple):
+    """What edits are baked for."""
+
+    camera: str | None = None
+    stack: str | None = None
+    width: int | None = None
+    height: int | None = None
+    quality: Quality = PREVIEW
+
+
+#: The camera, stack and size that the stage names.
+ANYTHING = Shot()
+
+
+class _Key(NamedTuple):
+    time: float | None
+    payload: Payload
+    baked: BakedRows
+
+
+def bake_edits(
+    stage: Any,
+    edits: Sequence[str],
+    *,
+    layer: str,
+    shot: Shot = ANYTHING,
+    frames: Sequence[float] | None = None,
+    epsilon: float = EPSILON,
+    coefficients: int | None = None,
+    forget_recipe: bool = False,
+    sidecar: str | Path | None = None,
+    why: str = "",
+    progress: Progress = silent,
+) -> Baked:
+    """Give each key of some edits a payload that holds sampled rows too, and save the layer.
+
+    Rows hold an edit at full amount: amount, blend, collections and lights
+    stay opinions in USD and act on rows as on recipes. Recipe and masks stay
+    in the payload.
+
+    Parameters
+    ----------
+    edits : paths of edits of the stack
+    frames
+        Times to bake at, each of which becomes a key. By default the edit's own keys; an edit without keys is baked
+        for all times, as the scene is at the stage's first frame.
+    epsilon, coefficients
+        See `encodings.bake.bake_field`.
+    forget_recipe : bool
+        Let the rows be what is evaluated from now on: the operation becomes "baked".
+    sidecar : path, optional
+        Folder or file for the payloads; beside the layer's file by default.
+
+    Raises
+    ------
+    EditError, SidecarError, StageError
+        An edit cannot be baked, or nothing can be written. The layer is then
+        as before, and no sidecar is left behind.
+    """
+    target = layers.find_layer(stage, layer)
+    beside = sidecar or target.realPath
+    if not beside:
+        raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
+    sessions = _Sessions(stage, shot, progress)
+    made: dict[str, list[_Key]] = {}
+    findings: list[Finding] = []
+    for path in edits:
+        made[path] = [_bake_key(sessions, path, time, epsilon, coefficients) for time in _times(stage, path, frames)]
+        findings += _warnings(sessions, path, made[path], forget_recipe)
+    written: list[Path] = []
+    keys: list[BakedKey] = []
+    try:
+        for path, parts in made.items():
+            payloads = [key.payload for key in parts]
+            anchor = anchor_path(edit_prim(stage, path))
+            file, digests = write_payloads(beside, payloads, anchor=anchor, history=history_entry(why, path))
+            written.append(file)
+            with layers.writing(stage, target, path):
+                for key, digest in zip(parts, digests, strict=True):
+                    findings += key_authoring.set_payload_key(
+                        stage, path, layer=target, time=key.time, payload=(file, digest)
+                    )
+                    keys.append(_described(path, key, file, digest))
+                if forget_recipe:
+                    findings += authoring.set_edit(stage, path, layer=target, operation=BAKED)
+        _save(target)
+    except Exception:
+        # Not after an interruption: the layer may have been saved already, and then names these files.
+        for file in written:
+            file.unlink(missing_ok=True)
+        raise
+    return Baked(tuple(keys), tuple(dict.fromkeys(findings)))
+
+
+def flatten_stack(
+    stage: Any,
+    name: str,
+    *,
+    layer: str,
+    shot: Shot = ANYTHING,
+    frames: Sequence[float] | None = None,
+    epsilon: float = EPSILON,
+    coefficients: int | None = None,
+    sidecar: str | Path | None = None,
+    why: str = "",
+    progress: Progress = silent,
+) -> Baked:
+    """Freeze a stack into one edit of operation "baked", mute what it was made of, and save the layer.
+
+    Edits that act on receivers after all others stay live behind it. Over
+    several frames, keys are put at the first and the last of them and, by
+    halving, wherever the rows in between are off by more than `epsilon`.
+
+    Parameters
+    ----------
+    name : str
+        Of the new edit's prim.
+    frames
+        Times that the result must hold at; otherwise one payload for all times.
+
+    Raises
+    ------
+    EditError, SidecarError, StageError
+        As `bake_edits`.
+    """
+    target = layers.find_layer(stage, layer)
+    beside = sidecar or target.realPath
+    if not beside:
+        raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
+    sessions = _Sessions(stage, shot, progress)
+    first = sessions.at(frames[0] if frames else None)
+    stack_path, stack = first.stack_path, first.stack
+    parts = [edit.path for edit in _pair_edits(stack).active]
+    if stack_path is None or not parts:
+        raise EditError(f"{stack_path or 'the stage'} has no active edit to flatten; name another stack with --stack")
+    times: Sequence[float | None] = sorted(set(frames)) if frames else [None]
+    baked = {time: _bake_stack(sessions, time, stack_path, epsilon, coefficients) for time in {times[0], times[-1]}}
+    pending = [(times[0], times[-1])] if len(times) > 1 else []
+    while pending:
+        low, high = pending.pop()
+        assert low is not None and high is not None
+        inside = [time for time in times if time is not None and low + _CLOSEST_KEYS <= time <= high - _CLOSEST_KEYS]
+        if not inside:
+            continue
+        middle = min(inside, key=lambda time: abs(time - (low + high) / 2))
+        weight = (middle - low) / (high - low)
+        session, field = _stack_at(sessions, middle)
+        work = PairSamples(field, session.view, session.gather, *_light(session, field))
+        keys = [(baked[low].rows, 1 - weight), (baked[high].rows, weight)]
+        if largest_error(work, keys, session.snapshot) > max(epsilon, baked[low].measured, baked[high].measured):
+            baked[middle] = _bake_stack(sessions, middle, stack_path, epsilon, coefficients)
+            pending += [(low, middle), (middle, high)]
+    anchor = _anchor(stage)
+    made = [
+        _Key(
+            time,
+            Payload(BAKED, {}, rows=baked[time].rows, made_against=facts(sessions.at(time).snapshot, anchor)),
+            baked[time],
+        )
+        for time in sorted(baked, key=lambda t: (t is not None, t or 0.0))
+    ]
+    file: Path | None = None
+    findings: list[Finding] = []
+    try:
+        history = history_entry(why, f"{stack_path}/{name}")
+        file, digests = write_payloads(beside, [key.payload for key in made], anchor=anchor, history=history)
+        with layers.writing(stage, target, stack_path):
+            path = authoring.add_edit(
+                stage,
+                stack_path,
+                name,
+                layer=target,
+                operation=BAKED,
+                receivers=Members((anchor,)),
+                casters=Members((anchor,)),
+                payload=(file, digests[0]),
+                time=made[0].time,
+            )
+            for key, digest in zip(made[1:], digests[1:], strict=True):
+                findings += key_authoring.set_payload_key(
+                    stage, path, layer=target, time=key.time, payload=(file, digest)
+                )
+            for part in parts:
+                findings += authoring.set_edit(stage, part, layer=target, enabled=False)
+        _save(target)
+    except Exception:
+        if file is not None:
+            file.unlink(missing_ok=True)
+        raise
+    keys_written = tuple(_described(path, key, file, digest) for key, digest in zip(made, digests, strict=True))
+    return Baked(keys_written, tuple(dict.fromkeys(findings)))
+
+
+def bakeable_edits(stage: Any, stack: str) -> list[str]:
+    """Edits of a stack that can be baked anew: those whose operation is known, makes pairs, and needs no rays.
+
+    Raises
+    ------
+    EditError
+        There are none.
+    """
+    found = []
+    for edit in describe_stack(stage, stack).edits:
+        operation = find(str(edit.operation.value))
+        if operation is not None and operation.level is not Level.VIEW and not operation.has_through:
+            found.append(edit.path)
+    if not found:
+        raise EditError(f"{stack} has no edit that rows could hold; see `icheat tree` for what its edits do")
+    return found
+
+
+class _Sessions:
+    """A session for each frame that is baked at; the last two are kept, for what lies between."""
+
+    def __init__(self, stage: Any, shot: Shot, progress: Progress) -> None:
+        self._stage, self._shot, self.progress = stage, shot, progress
+        self._open: dict[float | None, Session] = {}
+
+    def at(self, frame: float | None) -> Session:
+        if frame not in self._open:
+            while len(self._open) > 1:
+                self._open.pop(next(iter(self._open)))
+            shot = self._shot
+            self._open[frame] = Session.open(
+                self._stage,
+                camera=shot.camera,
+                frame=frame,
+                stack=shot.stack,
+                width=shot.width,
+                height=shot.height,
+                quality=shot.quality,
+                progress=self.progress,
+            )
+        return self._open[frame]
+
+
+def _times(stage: Any, path: str, frames: Sequence[float] | None) -> Sequence[float | None]:
+    if frames:
+        return sorted(set(frames))
+    track = read_keys(edit_prim(stage, path))
+    # Keys that are the identity need no rows.
+    times = [key.time for key in track.keys if key.digest] if track is not None else []
+    return times or [None]
+
+
+def _bake_key(sessions: _Sessions, path: str, time: float | None, epsilon: float, coefficients: int | None) -> _Key:
+    session = sessions.at(time)
+    edit = next((edit for edit in session.stack.edits if edit.path == path), None)
+    if edit is None:
+        raise EditError(f"{path}: is no edit of the stack {session.stack_path}; name another one with --stack")
+    if find(edit.operation) is None:
+        raise EditError(f"{path}: operation '{edit.operation}' is not known here, so nothing can be baked anew from it")
+    field = bind(at_full_amount(edit), session.snapshot)
+    baked = _bake(session, field, path, epsilon, coefficients)
+    anchor = anchor_path(edit_prim(session.stage, path))
+    made_against = facts(session.snapshot, anchor, edit=edit)
+    payload = payload_at(session.stage, path, time, made_against)
+    return _Key(time, replace(payload, rows=baked.rows, made_against=made_against), baked)
+
+
+def _pair_edits(stack: EditStack) -> EditStack:
+    """The stack without edits that act on receivers alone, which come last wherever they stand."""
+    return replace(stack, edits=tuple(edit for edit in stack.edits if not _is_view(edit)))
+
+
+def _is_view(edit: Edit) -> bool:
+    operation = find(edit.operation)
+    return operation is not None and operation.level is Level.VIEW
+
+
+def _stack_at(sessions: _Sessions, time: float | None) -> tuple[Session, EditField]:
+    session = sessions.at(time)
+    return session, bind(_pair_edits(session.stack), session.snapshot)
+
+
+def _bake_stack(
+    sessions: _Sessions, time: float | None, where: str, epsilon: float, coefficients: int | None
+) -> BakedRows:
+    session, field = _stack_at(sessions, time)
+    return _bake(session, field, where, epsilon, coefficients)
+
+
+def _bake(session: Session, field: EditField, where: str, epsilon: float, coefficients: int | None) -> BakedRows:
+    check_bakeable(field, where)
+    radiance, transport = _light(session, field)
+    return bake_field(
+        field,
+        session.view,
+        session.gather,
+        session.snapshot,
+        where=where,
+        radiance=radiance,
+        transport=transport,
+        epsilon=epsilon,
+        coefficients=coefficients,
+        progress=session.progress,
+    )
+
+
+def _light(session: Session, field: EditField) -> tuple[Any, Any]:
+    """Radiance and transport, computed only where the field looks at light."""
+    radiance = session.cell_light.total() if field.uses_incident or field.aggregates else None
+    return radiance, session.transport if field.aggregates else None
+
+
+def _warnings(sessions: _Sessions, path: str, keys: list[_Key], forget_recipe: bool) -> list[Finding]:
+    session = sessions.at(keys[0].time)
+    edit = next(edit for edit in session.stack.edits if edit.path == path)
+    operation = find(edit.operation)
+    found: list[Finding] = []
+    if operation is not None and (operation.uses_incident or operation.level is Level.AGGREGATE):
+        text = f"operation '{operation.name}' looks at the light, so its rows hold for the lights as they are now"
+        found.append(EditFinding(path, "icheat:payload", text))
+    soft = (
+        edit.receivers.limits
+        or edit.casters.limits
+        or any(key.payload.receiver_mask is not None or key.payload.caster_mask is not None for key in keys)
+    )
+    if forget_recipe and edit.blend is Blend.OVER and soft:
+        text = (
+            "rows hold soft masks multiplied in, so that blend 'over' replaces weaker edits all over its collections;"
+            " keep the recipe, or flatten the stack"
+        )
+        found.append(EditFinding(path, "icheat:blend", text))
+    return found
+
+
+def _described(path: str, key: _Key, file: Path, digest: str) -> BakedKey:
+    rows = key.baked.rows
+    operation = key.payload.operation
+    return BakedKey(
+        edit=path,
+        time=key.time,
+        payload=digest,
+        file=str(file),
+        cheapest=choose(operation, dict(key.payload.parameters), path).value,
+        view_samples=key.baked.n_view,
+        sites=len(rows.site_row),
+        rows=len(rows.row_pattern),
+        gather_samples=rows.n_leaves,
+        coefficients=len(rows.indices),
+        stored_bytes=sum(i.stored_bytes for i in list_elements(file) if i.payload == digest and i.element == "rows"),
+        epsilon_scale=rows.epsilon_scale,
+        epsilon_emission=rows.epsilon_emission,
+        epsilon_offset=rows.epsilon_offset,
+        measured_error=key.baked.measured,
+        lost_radiance=key.baked.lost,
+    )
+
+
+def _anchor(stage: Any) -> str:
+    default = stage.GetDefaultPrim()
+    return str(default.GetPath()) if default else "/"
+
+
+def _save(target: Any) -> None:
+    if not target.anonymous:
+        layers.save_layer(target)
