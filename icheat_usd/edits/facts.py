@@ -37,7 +37,7 @@ class SurfaceFacts(NamedTuple):
     """All surfaces of one path: one, or those of a point instancer."""
 
     n: int
-    topology: str  #: digest of control faces, 12 hexadecimal digits; summed over surfaces, as `shape` is
+    topology: str  #: digest of control faces, 8 hexadecimal digits; summed over surfaces, as `shape` is
     shape: str  #: digest of points and normals in object space
     look: str  #: digest of materials, where the light matters; else zero
     place: F64  #: (3, 4) mean transform, metres about the scene's centre
@@ -158,7 +158,7 @@ def surface_facts(snapshot: SceneSnapshot, anchor: str, *, looks: bool) -> dict[
         surfaces = [snapshot.surfaces[geometry.instance_surface[i]] for i in instances]
         found[relative(path, anchor)] = SurfaceFacts(
             len(instances),
-            _sum_digests(surface.topology_digest[:12] for surface in surfaces),
+            _sum_digests(surface.topology_digest[:8] for surface in surfaces),
             _sum_digests(shapes[mesh] for mesh in geometry.instance_mesh[instances].tolist()),
             _sum_digests(seen[mesh] for mesh in geometry.instance_mesh[instances].tolist()),
             place,
@@ -191,18 +191,19 @@ def read_surfaces(text: str) -> dict[str, SurfaceFacts]:
     """The table that `facts` wrote. Raises `ValueError` for anything else."""
     found = {}
     for line in text.splitlines():
-        path, n, topology, shape, look, place, spread = line.split("\t")
-        matrix = _read_numbers(place, 12).reshape(3, 4)
+        path, digests, place, *several = line.split("\t")
+        topology, shape, look = digests.split()
         for digest in (topology, shape, look):
             int(digest, 16)
-        found[path] = SurfaceFacts(int(n), topology, shape, look, matrix, float(spread))
+        n, spread = (int(several[0]), float(several[1])) if several else (1, 0.0)
+        found[path] = SurfaceFacts(n, topology, shape, look, _read_place(place), spread)
     return found
 
 
 def _write_surfaces(rows: Mapping[str, SurfaceFacts], limit: int | None) -> str:
     def line(path: str, row: SurfaceFacts) -> str:
-        digests = (row.topology, row.shape, row.look)
-        return "\t".join([path, str(row.n), *digests, _numbers(row.place.ravel()), f"{row.spread:.7g}"])
+        cells = [path, f"{row.topology} {row.shape} {row.look}", _place(row.place)]
+        return "\t".join([*cells, *([str(row.n), f"{row.spread:.7g}"] if row.n > 1 else [])])
 
     named, others = _split(rows, limit)
     rest = sum_surfaces(others)
@@ -211,7 +212,7 @@ def _write_surfaces(rows: Mapping[str, SurfaceFacts], limit: int | None) -> str:
 
 def _shape_digest(snapshot: SceneSnapshot, mesh: int) -> str:
     rows = slice(int(snapshot.geometry.mesh_begin[mesh]), int(snapshot.geometry.mesh_begin[mesh + 1]))
-    digest = hashlib.blake2b(digest_size=6)
+    digest = hashlib.blake2b(digest_size=4)
     for table in (snapshot.geometry.points, snapshot.geometry.normals):
         digest.update(np.ascontiguousarray(table[rows]).data)
     return digest.hexdigest()
@@ -219,7 +220,7 @@ def _shape_digest(snapshot: SceneSnapshot, mesh: int) -> str:
 
 def _sum_digests(digests: Iterable[str]) -> str:
     """One of many, whatever their order; that of one is itself."""
-    return f"{sum(int(digest or '0', 16) for digest in digests) & 0xFFFF_FFFF_FFFF:012x}"
+    return f"{sum(int(digest or '0', 16) for digest in digests) & 0xFFFF_FFFF:08x}"
 
 
 # --------------------------------------------------------------------------- lights
@@ -271,14 +272,14 @@ def read_lights(text: str) -> dict[str, LightFacts]:
             image,
             _read_numbers(radiance, 3),
             _read_numbers(size, 2),
-            _read_numbers(place, 12).reshape(3, 4),
+            _read_place(place),
         )
     return found
 
 
 def _write_lights(rows: Mapping[str, LightFacts], limit: int | None) -> str:
     def line(path: str, row: LightFacts) -> str:
-        numbers = (_numbers(values.ravel()) for values in (row.radiance, row.size, row.place))
+        numbers = (_numbers(row.radiance), _numbers(row.size), _place(row.place))
         return "\t".join([path, str(row.n), row.kind, row.image, *numbers])
 
     named, others = _split(rows, limit)
@@ -307,7 +308,7 @@ def _look_digests(snapshot: SceneSnapshot) -> list[str]:
     for begin, end in zip(geometry.mesh_begin[:-1].tolist(), geometry.mesh_begin[1:].tolist(), strict=True):
         rows = geometry.material[begin:end]
         used, inverse = np.unique(rows, return_inverse=True)
-        digest = hashlib.blake2b(b"".join(of_material[row] for row in used.tolist()), digest_size=6)
+        digest = hashlib.blake2b(b"".join(of_material[row] for row in used.tolist()), digest_size=4)
         if len(used) > 1:
             digest.update(np.ascontiguousarray(inverse, np.int32).data)
         if shows_colour[used].any():
@@ -324,7 +325,7 @@ def _image_digest(snapshot: SceneSnapshot, row: int) -> str:
     n = size[0] * size[1]
     begin = int(textures.begin[row])
     texels = textures.texels[begin : begin + n : max(1, n // _MAX_TEXELS)]
-    digest = hashlib.blake2b(repr(size).encode(), digest_size=6)
+    digest = hashlib.blake2b(repr(size).encode(), digest_size=4)
     digest.update(np.ascontiguousarray(texels).data)
     return digest.hexdigest()
 
@@ -340,8 +341,26 @@ def _split(rows: Mapping[str, Row], limit: int | None) -> tuple[list[tuple[str, 
 
 
 def _numbers(values: Iterable[float] | NDArray[np.floating]) -> str:
-    # Seven digits: what float32 holds. `+ 0.0` makes -0 and 0 one text.
-    return " ".join(f"{float(value) + 0.0:.7g}" for value in values)
+    # Six digits: nearly what float32 holds. `+ 0.0` makes -0 and 0 one text.
+    return " ".join(f"{float(value) + 0.0:.6g}" for value in values)
+
+
+def _place(place: F64) -> str:
+    """A (3, 4) transform: four numbers, scale and translation, where it does not turn anything; else all twelve."""
+    scale = float(np.trace(place[:, :3])) / 3
+    if scale > 0 and np.abs(place[:, :3] - scale * np.eye(3)).max() <= 1e-6 * scale:
+        return _numbers([scale, *place[:, 3]])
+    # What is tiny beside the others is rounding, and would only be long.
+    kept = np.where(np.abs(place) > 1e-7 * np.abs(place).max(axis=0), place, 0.0)
+    return _numbers(kept.ravel())
+
+
+def _read_place(text: str) -> F64:
+    n = len(text.split())
+    if n != 4:
+        return _read_numbers(text, 12).reshape(3, 4)
+    scale, *translation = _read_numbers(text, 4)
+    return np.concatenate([scale * np.eye(3), np.reshape(translation, (3, 1))], axis=1)
 
 
 def _read_numbers(text: str, n: int) -> F64:

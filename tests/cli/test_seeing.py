@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pxr import Sdf
 
 from icheat_usd.cli import main
 from icheat_usd.image.exr import read_exr
@@ -128,9 +129,9 @@ def test_stats_count_and_weigh(shot: Path, capsys: pytest.CaptureFixture[str]) -
 def test_check_exits_with_what_it_found(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert out(capsys, "check", shot) == ""
     assert as_json(capsys, "check", shot) == {"stage": str(shot), "findings": []}
-    saturation = "float icheat:hsv:saturation = 0.2\n"
-    assert saturation in shot.read_text()
-    shot.write_text(shot.read_text().replace(saturation, f"{saturation}            float icheat:amuont = 1\n"))
+    layer = Sdf.Layer.FindOrOpen(str(shot))
+    Sdf.AttributeSpec(layer.GetPrimAtPath("/World/Edits/grey"), "icheat:amuont", Sdf.ValueTypeNames.Float)
+    layer.Save()
     findings = as_json(capsys, "check", shot, status=1)["findings"]
     assert all(set(f) == {"prim", "feature", "message", "severity", "rule"} for f in findings) and findings
     assert {f["severity"] for f in findings} == {"warning"}

@@ -14,7 +14,6 @@ from icheat_usd.edits.operations.constants import baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.stage import schema
 from icheat_usd.stage.check.rule import Context, Found, Rule
-from icheat_usd.stage.edit_stack import anchor_path
 from icheat_usd.stage.keys import Key, read_keys, strongest_opinion
 from icheat_usd.stage.parameters import authored_parameters
 from icheat_usd.stage.stacks import Severity
@@ -96,7 +95,7 @@ def stale_because(context: Context, prim: Usd.Prim, key: Key, payload: Payload) 
     if time is None:
         made_at = payload.made_against.get("time")
         time = float(made_at) if isinstance(made_at, (int, float)) else context.time
-    now = context.facts_at(time, anchor_path(prim))
+    now = context.facts_at(prim, time)
     return () if now is None else staleness.stale_because(payload, payload.operation, now)
 
 

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 from pxr import Usd
 
-from icheat_usd.edits.facts import Facts, facts
-from icheat_usd.edits.model import Payload
+from icheat_usd.edits.facts import Facts, facts, selection_facts
+from icheat_usd.edits.model import Edit, Payload
 from icheat_usd.errors import IcheatError
-from icheat_usd.stage import schema
+from icheat_usd.scene import SceneSnapshot
+from icheat_usd.stage import collections, schema
 from icheat_usd.stage.edit_stack import PayloadReader, anchor_path, open_asset
 from icheat_usd.stage.keys import Key, read_keys
-from icheat_usd.stage.stacks import Severity, listed_edits
+from icheat_usd.stage.selections import with_limits
+from icheat_usd.stage.spaces import read_target
+from icheat_usd.stage.stacks import Severity, listed_edits, targets
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,8 @@ class Context:
     read_payload: PayloadReader | None = None
     listed: frozenset[str] = field(default=frozenset())  #: paths of edits that some stack lists
     _payloads: dict[tuple[str, str, str], Payload | IcheatError] = field(default_factory=dict)
-    _facts: dict[tuple[float | None, str], Facts | None] = field(default_factory=dict)
+    _scenes: dict[float | None, SceneSnapshot] = field(default_factory=dict)
+    _facts: dict[tuple[float | None, str], Facts] = field(default_factory=dict)
 
     def payload(self, prim: Usd.Prim, key: Key) -> Payload | None:
         """The payload of a key; None where nothing was given to read it with.
@@ -72,18 +76,30 @@ class Context:
             if payload is not None:
                 yield key, payload
 
-    def facts_at(self, time: float | None, anchor: str) -> Facts | None:
-        """What the scene is like at a time, in full; None where it cannot be read."""
-        if (time, anchor) not in self._facts:
-            # Loaded when needed: hosts without kernels check stages too.
-            from icheat_usd.stage.snapshot import AUTO_CAMERA, take_snapshot
+    def facts_at(self, prim: Usd.Prim, time: float | None) -> Facts | None:
+        """What the scene and an edit's selections are like at a time, in full; None where they cannot be read."""
+        # Loaded when needed: hosts without kernels check stages too.
+        from icheat_usd.stage.snapshot import AUTO_CAMERA, take_snapshot
 
-            try:
-                snapshot = take_snapshot(self.stage, camera=AUTO_CAMERA, time=time)
+        anchor = anchor_path(prim)
+        try:
+            if time not in self._scenes:
+                self._scenes[time] = take_snapshot(self.stage, camera=AUTO_CAMERA, time=time)
+            snapshot = self._scenes[time]
+            if (time, anchor) not in self._facts:
                 self._facts[time, anchor] = facts(snapshot, anchor, limit=False)
-            except IcheatError:
-                self._facts[time, anchor] = None
-        return self._facts[time, anchor]
+            selected = selected_by(prim, time, frozenset(surface.path for surface in snapshot.surfaces))
+        except IcheatError:
+            return None
+        return self._facts[time, anchor] | selection_facts(selected, anchor)
+
+
+def selected_by(prim: Usd.Prim, time: float | None, surface_paths: frozenset[str]) -> Edit:
+    """An edit as far as its selections and aims go."""
+    receivers, casters = (collections.select(prim, n, surface_paths) for n in (schema.RECEIVERS, schema.CASTERS))
+    edit = Edit(str(prim.GetPath()), "", {}, receivers, casters, occluders=targets(prim, schema.OCCLUDERS))
+    edit, _ = with_limits(prim, edit, time, surface_paths)
+    return replace(edit, target=read_target(prim, time)[0])
 
 
 Found = Iterator[tuple[Usd.Prim, str, str]]  #: prim, property or "", message
