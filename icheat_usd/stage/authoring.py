@@ -221,14 +221,15 @@ def remove_edit(
         path = _listed(prim, edit)
         relationship = _relationship(prim, schema.EDITS)
         relationship.RemoveTarget(path)
+        own = spec_path(stage, relationship.GetPath())
         if path in relationship.GetTargets():
             stronger = [
-                spec.layer.identifier
+                spec.layer.identifier + ("" if spec.layer != target else f" at {spec.path}")
                 for spec in relationship.GetPropertyStack()
-                if spec.layer != target and path in spec.targetPathList.GetAddedOrExplicitItems()
+                if (spec.layer, spec.path) != (target, own) and path in spec.targetPathList.GetAddedOrExplicitItems()
             ]
             raise EditError(f"{path} is listed by {', '.join(stronger)}, which is stronger; remove it there")
-        items = target.GetRelationshipAtPath(spec_path(stage, relationship.GetPath())).targetPathList
+        items = target.GetRelationshipAtPath(own).targetPathList
         if not items.isExplicit:
             items.deletedItems.remove(path)
             if path in relationship.GetTargets():  # A weaker layer lists it, so that the deletion is needed.
@@ -276,6 +277,8 @@ def _move(stack: Usd.Prim, path: Sdf.Path, layer: Sdf.Layer, *, before: str | No
         items.prependedItems = [p for p in items.prependedItems if p not in tail]
         items.deletedItems = [p for p in items.deletedItems if p not in tail]
         items.appendedItems = [p for p in items.appendedItems if p not in tail] + tail
+        if items.orderedItems:  # A reorder statement, which other tools write, acts after all else.
+            items.orderedItems = wanted
     if list(relationship.GetTargets()) != wanted:
         in_variant = place.ContainsPrimVariantSelection()
         stronger = "what a layer says beside the variant" if in_variant else f"a layer stronger than {layer.identifier}"

@@ -219,6 +219,27 @@ CASES = (
         },
     ),
     Case(
+        "a block among time samples gives the fallback from there on",
+        {
+            "sequence.usda": layer(
+                stack(
+                    warm(amount({1: 0.25, 3: "None", 9: 0.5}), color={1: (2, 2, 2), 3: "None"}),
+                    dim(gain={1: 0.25, 9: "None"}),
+                    listed=ALL[:2],
+                ),
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(over("dim", amount(0.5))),
+        },
+        flat=stack(warm(color=(1, 1, 1)), dim(amount(0.5), gain=0.25), listed=ALL[:2]),
+        winners={
+            "warm.amount": "sequence.usda",
+            "warm.amount.source": "timeSamples",
+            "dim.gain": "sequence.usda",
+            "dim.amount": "shot.usda",
+        },
+    ),
+    Case(
         "a shot blocks a payload, which leaves an edit that does nothing",
         {
             "sequence.usda": KEYED_SEQUENCE,

@@ -70,6 +70,8 @@ def provenance(stage: Usd.Stage, opened: dict[str, Any]) -> dict[str, dict[str, 
         if listing.removed_by:
             found["removed"][edit] = name(listing.removed_by)
             continue
+        if not stage.GetPrimAtPath(listing.path):
+            continue  # What USD flattens has no inactive prims, but still their names.
         told = describe_edit(stage, listing.path, opened["time"])
         assert told.listed_by == listing.layer
         values = {"amount": told.amount, "enabled": told.enabled, "operation": told.operation, "blend": told.blend}

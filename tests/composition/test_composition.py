@@ -16,7 +16,7 @@ import pytest
 
 from icheat_usd.errors import SidecarError
 from tests.composition import cases_of_arcs, cases_of_layers
-from tests.composition.reading import read_case
+from tests.composition.reading import open_case, read_case
 from tests.composition.stages import Case, retimed, write_case, write_flat
 
 CASES = {case.name: case for case in (*cases_of_layers.CASES, *cases_of_arcs.CASES)}
@@ -48,6 +48,15 @@ def test_a_scaled_layer_offset_moves_all_times(case: Case, written: dict[str, An
     for how in case.retimings:
         moved = read_case(retimed(composed, how))
         assert moved["edits"] == read_case(flat)["edits"]
+
+
+def test_what_usd_flattens_means_the_same(case: Case, written: dict[str, Any]) -> None:
+    composed = written[case.name][0]
+    flattened = Path(composed["root"]).with_name("flattened.usda")
+    open_case(composed).Flatten().Export(str(flattened))
+    read = read_case(composed | {"root": str(flattened), "session": "", "muted": []})
+    wanted = read_case(composed)
+    assert (read["edits"], read["digest"]) == (wanted["edits"], wanted["digest"])
 
 
 def test_no_case_passes_by_what_the_sequence_says_alone(case: Case, written: dict[str, Any]) -> None:

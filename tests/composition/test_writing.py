@@ -102,6 +102,8 @@ def test_any_changes_in_any_layers_give_just_what_was_asked_for(
             assert texts(stage) == before
             continue
         assert set(changed(stage, before)) <= {Path(target.identifier).name}
+        spec = target.GetRelationshipAtPath(f"{STACK}.{schema.EDITS}")
+        assert not spec or not (spec.targetPathList.isExplicit or spec.targetPathList.prependedItems)
         composed = [str(path) for path in stage.GetPrimAtPath(STACK).GetRelationship(schema.EDITS).GetTargets()]
         if step == "add":
             # A stronger layer may have put its edits behind all that weaker ones append.
@@ -180,6 +182,26 @@ def test_a_grade_is_set_moved_muted_and_removed_in(graded: Usd.Stage) -> None:
     assert names(graded) == ["rim", "warm"]
     select(graded, "dusk")
     assert names(graded) == ["dim", "warm"]
+
+
+def test_what_is_listed_beside_a_variant_is_not_removed_in_it(graded: Usd.Stage) -> None:
+    before = texts(graded)
+    for where, message in (
+        ("shot.usda", "sequence.usda, which"),
+        ("sequence.usda", f"sequence.usda at {STACK}.icheat"),
+    ):
+        with pytest.raises(EditError, match=f"warm is listed by .*{message}.* is stronger; remove it there"):
+            remove_edit(graded, STACK, "warm", layer=where, variant=("grade", "dusk"))
+    assert texts(graded) == before
+
+
+def test_a_move_in_a_layer_with_a_reorder_statement_takes_effect(tmp_path: Path) -> None:
+    stage = write(tmp_path, SEQUENCE, shot(listed=["hue", "dim", "warm"], how="reorder"))
+    assert names(stage) == ["hue", "dim", "warm"]
+    move_edit(stage, STACK, "warm", layer="shot.usda", before="dim")
+    assert names(stage) == ["hue", "warm", "dim"]
+    move_edit(stage, STACK, "hue", layer="shot.usda")
+    assert names(stage) == ["warm", "dim", "hue"]
 
 
 def test_what_is_said_beside_a_variant_is_stronger_and_reported(graded: Usd.Stage) -> None:
