@@ -148,5 +148,5 @@ def _contents(files: Sequence[str]) -> tuple[dict[str, str], dict[str, str], lis
 
 def _about(entries: Sequence[History], digests: Collection[str]) -> list[History]:
     """What the entries say about these payloads; entries about none are left out."""
-    kept = [History(e.who, e.why, e.when, tuple(digest for digest in e.payloads if digest in digests)) for e in entries]
+    kept = [replace(e, payloads=tuple(digest for digest in e.payloads if digest in digests)) for e in entries]
     return [entry for entry in kept if entry.payloads]

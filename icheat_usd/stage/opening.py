@@ -83,6 +83,9 @@ def composition_findings(stage: Usd.Stage) -> tuple[Finding, ...]:
 
 
 def _first_reason(error: Tf.ErrorException) -> str:
-    commentaries = [str(getattr(part, "commentary", part)) for part in error.args]
+    try:
+        commentaries = [str(getattr(part, "commentary", part)) for part in error.args]
+    except UnicodeDecodeError:
+        return "it holds text that is not UTF-8"
     reason = " ".join(commentaries[0].split()) if commentaries else "no reason given"
     return reason if len(reason) <= 200 else reason[:197] + "..."

@@ -6,9 +6,10 @@ import functools
 from collections.abc import Callable
 from typing import Concatenate, ParamSpec, TypeVar
 
-from pxr import Tf, Usd
+from pxr import Sdf, Tf, Usd
 
 from icheat_usd.errors import StageError
+from icheat_usd.stage.opening import quiet_usd
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -27,12 +28,34 @@ def named_refusals(
     @functools.wraps(function)
     def reading(stage: Usd.Stage, *args: P.args, **kwargs: P.kwargs) -> R:
         try:
-            return function(stage, *args, **kwargs)
+            with quiet_usd():
+                return function(stage, *args, **kwargs)
         except Tf.ErrorException as error:
             said = str(getattr(error.args[0], "commentary", error.args[0])) if error.args else ""
             reason = " ".join(said.split())[:300] or "without a reason"
             raise StageError(
                 f"{stage.GetRootLayer().identifier}: USD refuses what a layer says ({reason}); correct it there"
             ) from error
+        except (TypeError, ValueError) as error:
+            # A mistake of ours, unless a layer holds a value of another type than its attribute has.
+            if (mistyped := _mistyped(stage)) is None:
+                raise
+            raise StageError(mistyped) from error
 
     return reading
+
+
+def _mistyped(stage: Usd.Stage) -> str | None:
+    """The first opinion whose type is not that of its attribute."""
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)):
+        for attribute in prim.GetAuthoredAttributes():
+            declared = attribute.GetTypeName()
+            for spec in attribute.GetPropertyStack():
+                if not isinstance(spec, Sdf.AttributeSpec):
+                    return f"{attribute.GetPath()} is a relationship in {spec.layer.identifier}; make it {declared}"
+                if spec.typeName.type != declared.type:
+                    return (
+                        f"{attribute.GetPath()} is authored as {spec.typeName} in {spec.layer.identifier}, but it is "
+                        f"{declared}; correct it there"
+                    )
+    return None

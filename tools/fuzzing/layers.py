@@ -242,8 +242,8 @@ def case(number: int, folder: Path) -> Path:
         for _ in range(choose.choice((1, 1, 2, 4))):
             try:
                 choose.choice(_LAYER_CHANGES)(choose, layer, path.name)
-            except (Tf.ErrorException, RuntimeError, TypeError, ValueError):
-                pass  # USD refuses to author it
+            except (Tf.ErrorException, RuntimeError, TypeError, ValueError, IndexError):
+                pass  # USD refuses to author it, or there is nothing left to change
         path = path.with_suffix(choose.choice((".usda", ".usda", ".usdc")))
         layer.Export(str(path))
     if not path.exists():
