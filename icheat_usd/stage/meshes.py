@@ -271,7 +271,8 @@ def _read_control_mesh(
         return None
     points, counts, indices = topology
     if deformation is not None:
-        points = deformation.points(points)
+        moved = deformation.points(points)
+        points, deformation = (points, None) if moved is None else (moved, deformation)
     scheme = str(mesh.GetSubdivisionSchemeAttr().Get(time) or "catmullClark")
     if scheme == "loop":
         report(prim, "subdivisionScheme loop", "Loop subdivision is not supported; the control mesh is used, smoothed.")

@@ -111,8 +111,8 @@ class Deformation:
     _shapes: _Shapes | None
     _report: Reporter
 
-    def points(self, rest: F64) -> F64:
-        """Points (n, 3) in the prim's own space; those at rest, with a finding, where USD cannot tell."""
+    def points(self, rest: F64) -> F64 | None:
+        """Points (n, 3) in the prim's own space; None, with a finding, where USD cannot tell."""
         points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rest, np.float32))
         try:
             moved = (self._shapes is None or self._shapes.move(points)) and (
@@ -126,9 +126,13 @@ class Deformation:
                 "skinning",
                 f"its influences or blend shapes do not fit its {len(rest)} points; it is at rest.",
             )
-            return rest
+            return None
         result = np.array(points, np.float64)
-        return result if self._joints is None else _transformed(result, np.array(self._joints.to_mesh))
+        result = result if self._joints is None else _transformed(result, np.array(self._joints.to_mesh))
+        if not np.isfinite(result).all():
+            self._report(self.prim, "skinning", "a weight, joint or offset is not finite; it is at rest.")
+            return None
+        return result
 
     def normals(self, rest: F64, vertex: I64, n_points: int) -> F64:
         """Normals in the prim's own space, not unit.

@@ -337,6 +337,11 @@ def joint_negative(stage: Usd.Stage) -> None:
     attribute.Set([-1] * len(attribute.Get()))
 
 
+def weights_not_finite(stage: Usd.Stage) -> None:
+    attribute = stage.GetPrimAtPath("/World/Leg/Mesh").GetAttribute("primvars:skel:jointWeights")
+    attribute.Set([float("nan")] * len(attribute.Get()))
+
+
 def short_weights(stage: Usd.Stage) -> None:
     stage.GetPrimAtPath("/World/Leg/Mesh").GetAttribute("primvars:skel:jointWeights").Set([1.0, 0.0])
 
@@ -377,6 +382,7 @@ def short_shape(stage: Usd.Stage) -> None:
         no_skeleton,
         joint_beyond,
         joint_negative,
+        weights_not_finite,
         short_weights,
         short_both,
         bind_poses_missing,
@@ -422,3 +428,17 @@ def test_outside_figures_lie_where_usd_bakes_them(shared_scenes: Path, name: str
         assert along.mean() > 0.9
         assert not [finding for finding in snapshot.findings if "skin" in finding.feature]
     assert min(np.abs(boxes[0] - boxes[1]).max(), np.abs(boxes[1] - boxes[2]).max()) > 0.02
+
+
+def test_the_blend_shapes_of_openusd_itself_give_its_ground_truth(shared_scenes: Path) -> None:
+    file = shared_scenes / "openusd_testenv/testUsdImagingGLSkelBlendShapes/blendshapes.usda"
+    if not file.exists():
+        pytest.skip(f"no {file}")
+    stage = open_stage(file)
+    truth = UsdGeom.Mesh.Get(stage, "/GroundTruth/Mesh").GetPointsAttr()
+    times = truth.GetTimeSamples() or [stage.GetStartTimeCode()]
+    for time in (times[0], times[len(times) // 2], times[-1]):
+        snapshot = take_snapshot(stage, camera="auto", time=time)
+        found, expected = (world_points(snapshot, path)[0] for path in ("/TestPlane/Mesh", "/GroundTruth/Mesh"))
+        aside = expected.mean(axis=0) - found.mean(axis=0)  # it stands beside
+        np.testing.assert_allclose(found + aside, expected, atol=1e-5 * np.ptp(expected))
