@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
@@ -62,6 +62,7 @@ def test_division_table(
     np.testing.assert_allclose(found.emission, [emission], rtol=2e-5, atol=1e-25)
 
 
+@settings(deadline=None)
 @given(color, color)
 def test_division_reproduces_what_was_wanted(incident, wanted):
     have, want = np.array([incident], np.float32), np.array([wanted], np.float32)
@@ -70,6 +71,7 @@ def test_division_reproduces_what_was_wanted(incident, wanted):
     assert (found.scale <= MAX_RATIO).all() and np.isfinite(found.scale).all()
 
 
+@settings(deadline=None)
 @given(color, st.floats(-720, 720), st.floats(0, 1), st.floats(0, 4))
 def test_hsv_agrees_with_the_standard_library(rgb, hue, saturation, value):
     h, s, v = colorsys.rgb_to_hsv(*rgb)
@@ -79,6 +81,7 @@ def test_hsv_agrees_with_the_standard_library(rgb, hue, saturation, value):
     np.testing.assert_allclose(found, expected, atol=2e-5 * max(1.0, value))
 
 
+@settings(deadline=None)
 @given(color, st.floats(0.001, 1000), st.floats(-180, 180), st.floats(0, 3))
 def test_hsv_is_homogeneous_so_that_geometry_cancels(rgb, k, hue, saturation):
     rgb32 = np.array([rgb], np.float32)
@@ -90,6 +93,7 @@ def test_hsv_is_homogeneous_so_that_geometry_cancels(rgb, k, hue, saturation):
 # --------------------------------------------------------------------------- gamma and curve
 
 
+@settings(deadline=None)
 @given(color, st.floats(0, 4), st.floats(0.001, 10))
 def test_gamma_is_the_power_in_units_of_the_pivot(rgb, exponent, pivot):
     expected = [pivot * (c / pivot) ** exponent if c > 0 else 0.0 for c in rgb]
@@ -97,6 +101,7 @@ def test_gamma_is_the_power_in_units_of_the_pivot(rgb, exponent, pivot):
     np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-30)
 
 
+@settings(deadline=None)
 @given(st.floats(0, 8), st.floats(0.001, 10))
 def test_gamma_keeps_its_pivot_and_black(exponent, pivot):
     found = remade("gamma", {"exponent": exponent, "pivot": pivot}, np.array([[pivot, 0, 0]], np.float32))
@@ -117,6 +122,7 @@ def knots(draw):
     return tuple(inputs.tolist()), tuple(outputs.tolist())
 
 
+@settings(deadline=None)
 @given(knots())
 def test_the_curve_is_scipys_and_never_falls(curve):
     inputs, outputs = curve
@@ -126,6 +132,7 @@ def test_the_curve_is_scipys_and_never_falls(curve):
     assert (np.diff(wide) >= -1e-12).all() and (wide >= 0).all()
 
 
+@settings(deadline=None)
 @given(knots())
 def test_the_curve_is_held_before_its_knots_and_goes_on_straight_after_them(curve):
     inputs, outputs = curve

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
@@ -82,12 +82,14 @@ def test_a_lobe_of_exponent_0_is_half_of_all_directions() -> None:
 # --------------------------------------------------------------------------- falloff
 
 
+@settings(deadline=None)
 @given(st.floats(0.0, 100.0), st.floats(0.01, 50.0))
 def test_the_physical_exponent_is_exactly_the_identity(distance, pivot):
     found = scale("falloff", {"exponent": 2.0, "pivot": pivot}, at((0, 0, 0)), at((distance, 0, 0)))
     assert found[0] == 1
 
 
+@settings(deadline=None)
 @given(st.floats(0, 4), st.floats(0.1, 10), st.floats(0.05, 20))
 def test_falloff_is_a_power_of_the_distance_in_units_of_the_pivot(exponent, pivot, distance):
     found = scale("falloff", {"exponent": exponent, "pivot": pivot}, at((0, 1, 0)), at((0, 1, distance)))
@@ -95,6 +97,7 @@ def test_falloff_is_a_power_of_the_distance_in_units_of_the_pivot(exponent, pivo
     assert found[0] == pytest.approx(expected, rel=1e-4)
 
 
+@settings(deadline=None)
 @given(st.floats(-4, 8), st.floats(0.1, 10))
 def test_light_at_the_pivot_distance_stays(exponent, pivot):
     found = scale("falloff", {"exponent": exponent, "pivot": pivot}, at((0, 0, 0)), at((0, pivot, 0)))
@@ -118,6 +121,7 @@ def test_without_a_pivot_the_mean_distance_is_taken() -> None:
 # --------------------------------------------------------------------------- direction
 
 
+@settings(deadline=None)
 @given(unit, unit, st.floats(0, 8), st.floats(-1, 3))
 def test_a_white_surround_gives_every_receiver_as_much_as_before(normal, direction, sharpness, strength):
     parameters = {"direction": tuple(direction), "sharpness": sharpness, "strength": strength}
@@ -141,6 +145,7 @@ def test_the_greatest_strength_that_takes_no_more_than_all_light() -> None:
 # --------------------------------------------------------------------------- redirect
 
 
+@settings(deadline=None)
 @given(unit, unit, st.floats(8, 90))
 def test_redirected_light_keeps_the_power_that_a_caster_sends(normal, towards, spread):
     place = np.array([0.3, -0.2, 0.5])
