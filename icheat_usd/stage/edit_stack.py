@@ -20,6 +20,7 @@ from icheat_usd.stage.parameters import (
     authored_parameters,
     fallback_parameters,
     mix_parameters,
+    read_flag,
     read_number,
     read_parameters,
 )
@@ -91,7 +92,7 @@ def read_edit_stack(
         read, more = _read_edit(edit, time, paths, read_payload)
         edits.append(read)
         findings += more
-    enabled = bool(schema.read_attribute(prim, schema.STACK_ENABLED, time))
+    enabled = read_flag(prim, schema.STACK_ENABLED, time)
     stack = EditStack(path=stack_path, edits=tuple(edits), enabled=enabled)
     anchors = {str(edit.GetPath()): anchor_path(edit) for edit in prims}
     return replace(stack, digest=stack_digest(stack, anchors)), tuple(findings)
@@ -111,7 +112,7 @@ def _read_edit(
         casters=_NOTHING,
         amount=read_number(prim, schema.AMOUNT, time),
         blend=_blend(prim, time),
-        enabled=bool(schema.read_attribute(prim, schema.ENABLED, time)),
+        enabled=read_flag(prim, schema.ENABLED, time),
         occluders=targets(prim, schema.OCCLUDERS),
     )
     receivers, casters = (_select(prim, name, surface_paths, edit) for name in (schema.RECEIVERS, schema.CASTERS))

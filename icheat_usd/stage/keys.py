@@ -180,7 +180,7 @@ def _key(
             f"{schema.PAYLOAD} has none; sample both at the same times"
         )
     asset = prim.GetAttribute(schema.FILE_PATH).Get(_asset_time(file_opinion, layer_time))
-    if asset is None or not asset.path:
+    if not isinstance(asset, Sdf.AssetPath) or not asset.path:
         at = "" if time is None else f" at time {time:g}"
         raise EditError(f"{prim.GetPath()}: {schema.FILE_PATH} names no file{at}; author it with {schema.PAYLOAD}")
     anchored = asset.resolvedPath or Sdf.ComputeAssetPathRelativeToLayer(file_opinion.layer, asset.path)

@@ -84,6 +84,20 @@ def read_number(prim: Usd.Prim, name: str, time: float | None) -> float:
     return float(value)
 
 
+def read_flag(prim: Usd.Prim, name: str, time: float | None) -> bool:
+    """The composed flag.
+
+    Raises
+    ------
+    EditError
+        It is neither true nor false, but of another type.
+    """
+    value = schema.read_attribute(prim, name, time)
+    if not isinstance(value, bool):
+        raise EditError(f"{prim.GetPath()}: {name} is {value!r}, expected true or false")
+    return value
+
+
 def require_finite(prim: Usd.Prim, name: str, value: Value) -> None:
     """Raise EditError if a number in `value` is not finite."""
     numbers = value if isinstance(value, tuple) else (value,)

@@ -248,6 +248,27 @@ def test_numbers_that_are_not_finite_are_errors(stage: Usd.Stage, name: str) -> 
         read_edit_stack(stage, STACK, None, SURFACES)
 
 
+@pytest.mark.parametrize(
+    ("name", "kind", "value", "message"),
+    [
+        (schema.AMOUNT, "string", "much", "amount is 'much', expected a number"),
+        (schema.ENABLED, "string", "false", "enabled is 'false', expected true or false"),
+        (schema.FILE_PATH, "string", "x.h5", "filePath names no file"),
+    ],
+)
+def test_a_value_of_another_type_is_one_clear_error(
+    stage: Usd.Stage, name: str, kind: str, value: str, message: str
+) -> None:
+    path = add(stage, "warm")
+    spec = layer(stage, "shot.usda")
+    over = Sdf.CreatePrimInLayer(spec, path)
+    Sdf.AttributeSpec(over, name, Sdf.ValueTypeNames.Find(kind)).default = value
+    if name == schema.FILE_PATH:
+        Sdf.AttributeSpec(over, schema.PAYLOAD, Sdf.ValueTypeNames.Token).default = DIGEST
+    with pytest.raises(EditError, match=message):
+        read_edit_stack(stage, STACK, None, SURFACES)
+
+
 def test_a_mistyped_parameter_means_nothing(stage: Usd.Stage) -> None:
     prim = stage.GetPrimAtPath(add(stage, "warm"))
     prim.CreateAttribute("icheat:scale:gian", Sdf.ValueTypeNames.Float).Set(3.0)
