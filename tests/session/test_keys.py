@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd
+from pxr import Usd, UsdGeom
 
 from icheat_usd.cli.program import run
+from icheat_usd.edits.binding import bind
 from icheat_usd.edits.model import Edit, Payload
 from icheat_usd.edits.painting import soft_sphere
 from icheat_usd.errors import EditError
+from icheat_usd.materials import points_on_surface
 from icheat_usd.session import Session, authoring, keys
 from icheat_usd.stage import open_stage
 from icheat_usd.stage.edit_stack import read_edit_stack
@@ -235,3 +237,24 @@ def test_splines_and_samples_of_amount_and_parameters_are_read_at_the_frame(stag
     # Flat tangents of a third of the way: the curve is the smoothstep.
     smooth = [3 * x * x - 2 * x**3 for x in (0.0, 0.1, 0.5, 0.9, 1.0)]
     assert eased == pytest.approx(smooth, abs=1e-5)
+
+
+def test_a_mesh_that_was_rebuilt_keeps_its_painted_edit_and_is_a_finding(stage: Usd.Stage) -> None:
+    def painted() -> Session:
+        return Session.open(stage, camera="/World/camera", frame=1, width=8, height=6)
+
+    assert not [f for f in painted().findings if f.feature == "painted mask"]
+    floor = UsdGeom.Mesh.Get(stage, SURFACES[0])
+    floor.GetPointsAttr().Set([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0.5, 0.5, 0)])
+    floor.GetFaceVertexCountsAttr().Set([3, 3])
+    floor.GetFaceVertexIndicesAttr().Set([0, 1, 3, 0, 3, 2])
+    session = painted()
+    (finding,) = [f for f in session.findings if f.feature == "painted mask"]
+    assert finding.prim == WARM and "another topology of /World/floor (1 faces then, 2 now)" in finding.message
+    snapshot = session.snapshot
+    receivers = bind(session.stack, snapshot).edits[0].receivers[0]
+    row = [surface.path for surface in snapshot.surfaces].index(SURFACES[0])
+    triangle = snapshot.geometry.mesh_begin[snapshot.geometry.instance_mesh[row]]
+    at = points_on_surface(snapshot, [row] * 2, [triangle] * 2, [[0.05, 0.0], [0.95, 0.0]], [0, 0])
+    near, far = receivers.at(at)
+    assert near > 0.8 and far < 0.1  # painted about the corner at the origin, which subdivision rounds
