@@ -113,6 +113,21 @@ INSTANCES = """
 """
 SEATS = ("/World/Chair/Seat", "/World/Left/Seat", "/World/Right/Seat")
 
+
+def zone(name: str, travel: str, softness: float) -> str:
+    """A sphere that edits are limited to, on its way."""
+    return f"""def Sphere "{name}" (
+    prepend apiSchemas = ["IcheatRegionAPI"]
+)
+{{
+    uniform token purpose = "guide"
+    double radius = 1.5
+    float icheat:softness = {softness}
+    double3 xformOp:translate.timeSamples = {{ {travel} }}
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}"""
+
+
 #: An amount that a cubic with flat ends eases from 0 at 1 to 1 at 9: 3 x^2 - 2 x^3 at x = (time - 1) / 8.
 SPLINE = """float icheat:amount.spline = {
     bezier,
@@ -311,6 +326,52 @@ CASES = (
         },
         flat=stack(edit("rosy", ROSY, receivers=[PILLAR], casters=[BLOCK]), listed=["rosy"]),
         winners={"rosy.color": "edits.usda"},
+    ),
+    Case(
+        "limits, lights and a target of a library follow the reference, the layers' times and the shot",
+        {
+            "library/edits.usda": library(
+                zone("zone", "1: (-1, -2, 0), 9: (1, -2, 0)", 0.5),
+                edit("rosy", ROSY, "rel icheat:receiverLimits = </Library/zone>"),
+                edit("turned", operation="redirect", spread=20),
+                body="append rel icheat:edits = [</Library/rosy>, </Library/turned>]",
+                metadata='prepend apiSchemas = ["IcheatStackAPI"]',
+            ),
+            "sequence.usda": layer(
+                'def "Edits" (\nprepend references = @./library/edits.usda@ (scale = 0.5)\n)\n{\n'
+                + over("rosy", select("Receivers", ROOM), select("Casters", ROOM), "rel icheat:lights = </World/Lamp>")
+                + "\n"
+                + over(
+                    "turned", select("Receivers", ROOM), select("Casters", ROOM), "rel icheat:target = </World/Block>"
+                )
+                + "\n}",
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": shot(
+                over("zone", "float icheat:softness = 0.75"), over("turned", f"rel icheat:target = <{PILLAR}>")
+            ),
+        },
+        flat=stack(
+            zone("zone", "0.5: (-1, -2, 0), 4.5: (1, -2, 0)", 0.75),
+            edit(
+                "rosy",
+                ROSY,
+                f"rel icheat:receiverLimits = <{STACK}/zone>",
+                "rel icheat:lights = </World/Lamp>",
+                receivers=[ROOM],
+                casters=[ROOM],
+            ),
+            edit(
+                "turned",
+                f"rel icheat:target = <{PILLAR}>",
+                operation="redirect",
+                spread=20,
+                receivers=[ROOM],
+                casters=[ROOM],
+            ),
+            listed=["rosy", "turned"],
+        ),
+        winners={"rosy.color": "edits.usda", "turned.spread": "edits.usda", "rosy.listed": "edits.usda"},
     ),
     Case(
         "a relocated edit is listed and overridden by its new path",

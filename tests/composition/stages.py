@@ -63,7 +63,14 @@ SCENE = """
     }
 """
 
-_TYPES = {"color": "color3f", "gain": "float", "hue": "float", "saturation": "float", "value": "float"}
+_TYPES = {
+    "color": "color3f",
+    "gain": "float",
+    "hue": "float",
+    "saturation": "float",
+    "value": "float",
+    "spread": "float",
+}
 
 
 def _payload(seed: int, **recipe: object) -> Payload:
