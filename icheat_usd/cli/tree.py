@@ -75,6 +75,7 @@ def _payloads_as_json(how: str, states: Any) -> dict[str, Any]:
             "elements": list(state.elements),
             "storedBytes": state.stored_bytes,
             "stale": list(state.stale),
+            "notes": list(state.notes),
             "problem": state.problem,
         }
         for state in states
@@ -121,6 +122,7 @@ def _details(edit: Any, states: Any) -> list[str]:
             held = f"  ({', '.join(state.elements)})" if state.elements else ""
             lines.append(f"payload {at}: {state.digest[:12]} in {os.path.basename(state.file)}{held}")
         lines += [f"  stale: {reason}" for reason in state.stale]
+        lines += [f"  note: {note}" for note in state.notes]
         lines += [f"  problem: {state.problem}"] if state.problem else []
     if edit.problem:
         lines.append(f"problem: {edit.problem}")

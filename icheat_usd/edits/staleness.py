@@ -30,6 +30,7 @@ __all__ = [
     "Facts",
     "Needs",
     "baked_parameters",
+    "camera_changes",
     "changes",
     "facts",
     "mask_changes",
@@ -101,6 +102,13 @@ def stale_because(payload: Payload, operation: str, now: Mapping[str, str | floa
     return tuple(change.text for change in changes(payload.made_against, now) if aspects.get(change.aspect, False))
 
 
+def camera_changes(payload: Payload, now: Mapping[str, str | float | int]) -> tuple[str, ...]:
+    """How the camera has changed that a payload's rows were sampled for; they hold, but for what it did not see."""
+    if payload.rows is None:
+        return ()
+    return tuple(change.text for change in changes(payload.made_against, now) if change.aspect is Aspect.CAMERA)
+
+
 def baked_parameters(payload: Payload, parameters: Mapping[str, Value]) -> tuple[str, ...]:
     """Parameters that are no longer those that the payload's baked form was made with, in words."""
     has_baked = payload.rows is not None or payload.scale_delta is not None
@@ -158,8 +166,10 @@ def changes(then: Mapping[str, str | float | int], now: Mapping[str, str | float
 def _camera_changes(then: Mapping[str, Any], now: Mapping[str, Any], motion: F64) -> list[Change]:
     found = []
     if _differ(then, now, "camera"):
-        found.append(f"another camera: {then['camera']} became {now['camera']}")
-    if _differ(then, now, "width") or _differ(then, now, "height"):
+        gone = f"camera {then['camera']} is gone"
+        found.append(f"another camera: {then['camera']} became {now['camera']}" if now["camera"] else gone)
+    sizes = _differ(then, now, "width") or _differ(then, now, "height")
+    if sizes and not (_differ(then, now, "camera") and not now["camera"]):
         was, is_ = (f"{f.get('width', '?')}x{f.get('height', '?')}" for f in (then, now))
         found.append(f"the resolution is {is_}, and was {was}")
     views = [_view(f) for f in (then, now)]

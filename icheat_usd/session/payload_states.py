@@ -33,6 +33,7 @@ class PayloadState:
     elements: tuple[str, ...] = ()
     stored_bytes: int = 0
     stale: tuple[str, ...] = ()  #: what has changed since it was painted or baked
+    notes: tuple[str, ...] = ()  #: what has changed and leaves it usable
     problem: str = ""  #: why it cannot be read
 
 
@@ -91,6 +92,7 @@ def _states(context: Context, edit: EditDescription, scene: bool) -> Iterator[Pa
             tuple(dict.fromkeys(info.element for info in infos)),
             sum(info.stored_bytes for info in infos),
             tuple(_stale(context, prim, key, payload, scene)),
+            baked.camera_changes(context, prim, key, payload) if scene else (),
         )
 
 

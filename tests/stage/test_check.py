@@ -18,6 +18,7 @@ from icheat_usd.resources import resource_path
 from icheat_usd.stage import schema, take_snapshot
 from icheat_usd.stage.authoring import add_edit, create_stack, remove_edit, set_payload_key
 from icheat_usd.stage.check import RULES, check_stage
+from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.stage.meshes import topology_digest
 from icheat_usd.stage.stacks import Severity
 from tests.stage.edit_stages import DIGEST, OTHER, RecordingReader, layer, python, shot_stage
@@ -388,6 +389,36 @@ def test_rows_are_stale_once_the_scene_has_changed_and_say_what(stage: Usd.Stage
     assert "surface floor moved; light key got brighter" in second
 
 
+def test_rows_of_a_camera_that_moved_or_went_are_noted(stage: Usd.Stage) -> None:
+    made = facts(take_snapshot(stage, camera="/World/camera", time=1.0, width=64, height=48), "/World")
+    warm(stage).GetRelationship(schema.ANCHOR).SetTargets(["/World"])
+    warm(stage).GetAttribute(schema.OPERATION).Set("baked")
+    rows: Any = object()
+    payload = Payload("scale", {}, rows=rows, made_against=made)
+    assert found(stage, first=payload, second=payload) == []
+    camera = UsdGeom.Camera.Get(stage, "/World/camera")
+    camera.AddTranslateOp().Set((0, 0, 0.5))
+    rules = found(stage, first=payload, second=payload)
+    assert {rule for rule, _ in rules} == {"BakedForOtherCamera"} and "camera camera moved" in rules[0][1]
+    camera.GetPrim().SetActive(False)
+    messages = [message for rule, message in found(stage, first=payload, second=payload) if rule.startswith("Baked")]
+    assert len(messages) == 2 and all("camera camera is gone;" in message for message in messages)
+
+
+def test_rows_of_another_selection_are_stale(stage: Usd.Stage) -> None:
+    snapshot = take_snapshot(stage, camera="auto", time=1.0)
+    warm(stage).GetRelationship(schema.ANCHOR).SetTargets(["/World"])
+    warm(stage).GetAttribute(schema.OPERATION).Set("baked")
+    read, _ = read_edit_stack(stage, "/World/indirect", 1.0, {s.path for s in snapshot.surfaces}, payloads(first=PLAIN))
+    edit = next(edit for edit in read.edits if edit.path == WARM)
+    rows: Any = object()
+    payload = Payload("scale", {}, rows=rows, made_against=facts(snapshot, "/World", edit=edit))
+    assert found(stage, first=payload, second=payload) == []
+    Usd.CollectionAPI(warm(stage), schema.RECEIVERS).GetIncludesRel().AddTarget("/World/Room")
+    messages = [message for _, message in found(stage, first=payload, second=payload)]
+    assert len(messages) == 2 and "the edit has other receivers" in messages[0]
+
+
 def test_rows_stay_fresh_under_another_name(stage: Usd.Stage) -> None:
     made = facts(take_snapshot(stage, camera="auto", time=1.0), "/World")
     warm(stage).GetRelationship(schema.ANCHOR).SetTargets(["/World"])
@@ -415,7 +446,8 @@ def test_hosts_find_the_rules_as_validators(stage: Usd.Stage, tmp_path: Path) ->
         "stage = Usd.Stage.Open(sys.argv[1])\n"
         "context = V.ValidationContext(keywords=['icheat'], includeAllAncestors=False)\n"
         "for e in context.Validate(stage):\n"
-        "    print(e.GetName(), e.GetType().name, *((s.GetProperty() or s.GetPrim()).GetPath() for s in e.GetSites()))\n"
+        "    places = [(s.GetProperty() or s.GetPrim()).GetPath() for s in e.GetSites()]\n"
+        "    print(e.GetName(), e.GetType().name, *places)\n"
     )
     from icheat_usd.plugin_path import search_path
 

@@ -52,6 +52,7 @@ RULES: tuple[Rule, ...] = (
     keys.CopiedKeysOutdated(),
     baked.BakedWithoutPayload(),
     baked.BakedStale(),
+    baked.BakedForOtherCamera(),
     baked.BakedParametersChanged(),
     baked.PaintedSurfaceChanged(),
 )

@@ -8,6 +8,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from icheat_usd.edits import operations, staleness
+from icheat_usd.edits.facts import Facts
 from icheat_usd.edits.model import Payload, SurfaceMask, Value
 from icheat_usd.edits.operations import Operation
 from icheat_usd.edits.operations.constants import baked_constants
@@ -50,6 +51,19 @@ class BakedStale(Rule):
                     yield prim, schema.PAYLOAD, f"what is baked{_at(key)} is stale: {'; '.join(because)}; bake it again"
 
 
+class BakedForOtherCamera(Rule):
+    doc = "The camera that a payload's rows were sampled for sees what it saw."
+    severity = Severity.WARNING
+
+    def find(self, context: Context) -> Found:
+        for prim in context.edits:
+            for key, payload in context.payloads(prim):
+                because = camera_changes(context, prim, key, payload)
+                if because:
+                    message = f"rows{_at(key)} were sampled for what a camera saw, and {'; '.join(because)}"
+                    yield prim, schema.PAYLOAD, f"{message}; places that it did not see fade out: bake it again"
+
+
 class BakedParametersChanged(Rule):
     doc = "What is baked was baked with the edit's operation and parameters as they are."
     severity = Severity.WARNING
@@ -87,16 +101,26 @@ def has_baked_form(payload: Payload) -> bool:
 
 def stale_because(context: Context, prim: Usd.Prim, key: Key, payload: Payload) -> tuple[str, ...]:
     """What has changed in the scene since a payload was baked; the scene is read only if it matters."""
+    now = _facts_now(context, prim, key, payload)
+    return () if now is None else staleness.stale_because(payload, payload.operation, now)
+
+
+def camera_changes(context: Context, prim: Usd.Prim, key: Key, payload: Payload) -> tuple[str, ...]:
+    """How the camera that rows were sampled for has changed since."""
+    now = _facts_now(context, prim, key, payload)
+    return () if now is None else staleness.camera_changes(payload, now)
+
+
+def _facts_now(context: Context, prim: Usd.Prim, key: Key, payload: Payload) -> Facts | None:
     known = operations.find(payload.operation)
     wanted = staleness.needs(known, has_rows=payload.rows is not None)
     if not (wanted.geometry or wanted.lights) or "surfaces" not in payload.made_against:
-        return ()
+        return None
     time = key.time
     if time is None:
         made_at = payload.made_against.get("time")
         time = float(made_at) if isinstance(made_at, (int, float)) else context.time
-    now = context.facts_at(prim, time)
-    return () if now is None else staleness.stale_because(payload, payload.operation, now)
+    return context.facts_at(prim, time, payload.made_against)
 
 
 def parameters_changed(prim: Usd.Prim, key: Key, payload: Payload, time: float | None) -> tuple[str, ...]:

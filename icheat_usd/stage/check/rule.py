@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-from pxr import Usd
+from pxr import Sdf, Usd
 
 from icheat_usd.edits.facts import Facts, facts, selection_facts
 from icheat_usd.edits.model import Edit, Payload
@@ -33,8 +33,8 @@ class Context:
     read_payload: PayloadReader | None = None
     listed: frozenset[str] = field(default=frozenset())  #: paths of edits that some stack lists
     _payloads: dict[tuple[str, str, str], Payload | IcheatError] = field(default_factory=dict)
-    _scenes: dict[float | None, SceneSnapshot] = field(default_factory=dict)
-    _facts: dict[tuple[float | None, str], Facts] = field(default_factory=dict)
+    _scenes: dict[tuple[object, ...], SceneSnapshot] = field(default_factory=dict)
+    _facts: dict[tuple[object, ...], Facts] = field(default_factory=dict)
 
     def payload(self, prim: Usd.Prim, key: Key) -> Payload | None:
         """The payload of a key; None where nothing was given to read it with.
@@ -76,22 +76,45 @@ class Context:
             if payload is not None:
                 yield key, payload
 
-    def facts_at(self, prim: Usd.Prim, time: float | None) -> Facts | None:
-        """What the scene and an edit's selections are like at a time, in full; None where they cannot be read."""
+    def facts_at(self, prim: Usd.Prim, time: float | None, then: Mapping[str, str | float | int]) -> Facts | None:
+        """What the scene and an edit's selections are like at a time, in full; None where they cannot be read.
+
+        Seen by the camera of `then`, at its size, where that camera is still there.
+        """
         # Loaded when needed: hosts without kernels check stages too.
         from icheat_usd.stage.snapshot import AUTO_CAMERA, take_snapshot
 
         anchor = anchor_path(prim)
+        camera, size = self._camera(anchor, then)
+        scene, seen = (time, camera, *size), (time, anchor, camera, *size)
         try:
-            if time not in self._scenes:
-                self._scenes[time] = take_snapshot(self.stage, camera=AUTO_CAMERA, time=time)
-            snapshot = self._scenes[time]
-            if (time, anchor) not in self._facts:
-                self._facts[time, anchor] = facts(snapshot, anchor, limit=False)
+            if scene not in self._scenes:
+                width, height = size
+                shot = take_snapshot(self.stage, camera=camera or AUTO_CAMERA, time=time, width=width, height=height)
+                self._scenes[scene] = shot
+            snapshot = self._scenes[scene]
+            if seen not in self._facts:
+                self._facts[seen] = facts(snapshot, anchor, limit=False)
             selected = selected_by(prim, time, frozenset(surface.path for surface in snapshot.surfaces))
         except IcheatError:
             return None
-        return self._facts[time, anchor] | selection_facts(selected, anchor)
+        now = self._facts[seen] | selection_facts(selected, anchor)
+        if then.get("camera") == AUTO_CAMERA:
+            del now["camera-view"]  # It moves with the bounds of the scene.
+        elif not camera:
+            now["camera"] = ""
+        return now
+
+    def _camera(self, anchor: str, then: Mapping[str, str | float | int]) -> tuple[str, tuple[int | None, int | None]]:
+        name = str(then.get("camera", ""))
+        path = name if name.startswith("/") or not name else f"{anchor.rstrip('/')}/{name}"
+        found = Sdf.Path.IsValidPathString(path) and self.stage.GetPrimAtPath(path)
+        if not found or not found.IsActive() or found.GetTypeName() != "Camera":
+            return "", (None, None)
+        width, height = (then.get(side) for side in ("width", "height"))
+        if not isinstance(width, int) or not isinstance(height, int) or not 0 < width * height < 1 << 32:
+            return path, (None, None)
+        return path, (width, height)
 
 
 def selected_by(prim: Usd.Prim, time: float | None, surface_paths: frozenset[str]) -> Edit:
