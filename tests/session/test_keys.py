@@ -12,9 +12,8 @@ from pxr import Usd, UsdGeom
 from icheat_usd.cli.program import run
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.model import Edit, Payload
-from icheat_usd.edits.painting import soft_sphere
+from icheat_usd.edits.painting import paint_mask, soft_sphere
 from icheat_usd.errors import EditError
-from icheat_usd.materials import points_on_surface
 from icheat_usd.session import Session, authoring, keys
 from icheat_usd.stage import open_stage
 from icheat_usd.stage.edit_stack import read_edit_stack
@@ -252,9 +251,9 @@ def test_a_mesh_that_was_rebuilt_keeps_its_painted_edit_and_is_a_finding(stage: 
     (finding,) = [f for f in session.findings if f.feature == "painted mask"]
     assert finding.prim == WARM and "another topology of /World/floor (1 faces then, 2 now)" in finding.message
     snapshot = session.snapshot
-    receivers = bind(session.stack, snapshot).edits[0].receivers[0]
-    row = [surface.path for surface in snapshot.surfaces].index(SURFACES[0])
-    triangle = snapshot.geometry.mesh_begin[snapshot.geometry.instance_mesh[row]]
-    at = points_on_surface(snapshot, [row] * 2, [triangle] * 2, [[0.05, 0.0], [0.95, 0.0]], [0, 0])
-    near, far = receivers.at(at)
-    assert near > 0.8 and far < 0.1  # painted about the corner at the origin, which subdivision rounds
+    carried = bind(session.stack, snapshot).edits[0].receivers[0].mask
+    assert carried is not None
+    anew = paint_mask(snapshot, [SURFACES[0]], soft_sphere(tuple(-np.array(snapshot.centre)), 0.1, 0.8)).texels
+    # Texels lie 1/16 apart, and the weights fall by 2.1 a metre at most.
+    np.testing.assert_allclose(carried.texels[-len(anew) :], anew, atol=0.5 * np.sqrt(2) / 16 * 2.2)
+    assert anew.min() == 0.0 and anew.max() > 0.8
