@@ -48,12 +48,12 @@ class Measures:
     def caster_area(self) -> float:
         """Area of the casters, weighted by their masks, square metres.
 
-        Both sides of a surface count, as they do where light is gathered.
+        Surfaces count once: a wall that shines on one side has the mean radiance of that side.
         """
         if self.casters.constant_on_instances:
-            return 2.0 * float(_instance_areas(self.snapshot) @ self.casters.on_instances)
+            return float(_instance_areas(self.snapshot) @ self.casters.on_instances)
         _, weight = _weighted_places(self.snapshot, self.casters, _N_PLACES)
-        return 2.0 * float(weight.sum())
+        return float(weight.sum())
 
 
 def _instance_areas(snapshot: SceneSnapshot) -> F64:

@@ -66,7 +66,7 @@ GREEN: tuple[float, float, float] = (0.5, 1.0, 0.25)
         ("receive", {"scale": GREEN, "offset": (0.1, 0.2, 0.3)}, INDIRECT * np.array(GREEN) + [0.1, 0.2, 0.3]),
         # The area of the box is 24 m^2; outside, where half of its sides look, there is no light.
         ("paint", {"color": GREEN, "relative": False}, INDIRECT + 24 * B * np.array(GREEN)),
-        ("paint", {"color": GREEN}, INDIRECT + 0.5 * B * np.array(GREEN)),
+        ("paint", {"color": GREEN}, INDIRECT + B * np.array(GREEN)),
     ],
 )
 def test_in_a_furnace_every_operation_gives_what_its_formula_says(

@@ -105,7 +105,7 @@ class BoundScene(Protocol):
         ...
 
     def caster_area(self) -> float:
-        """Area of the casters, weighted by their masks, square metres."""
+        """Area of the casters, each surface once, weighted by their masks, square metres."""
         ...
 
 

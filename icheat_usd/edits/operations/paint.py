@@ -25,9 +25,8 @@ class Paint(Operation):
     however finely these are sampled. Nothing holds it back: neither walls, nor
     distance, nor the receiver's albedo. Casters in the dark give nothing.
 
-    Limits: the mean is over both sides of the casters' surfaces, as both may
-    send light; a wall whose far side lies in the dark counts with half of the
-    radiance of its near side.
+    Limits: what both sides of a surface send adds up, over its area counted
+    once; a wall whose far side lies in the dark has the mean of its near side.
     """
 
     name = "paint"
