@@ -16,6 +16,10 @@ from icheat_usd.session import housekeeping, inspection
 from icheat_usd.session.origin import history_entry
 from icheat_usd.stage.pinned import PinnedKey, pinned_keys
 from icheat_usd.stage.sidecar_uses import repoint_layer
+from icheat_usd.stage.stacks import EditFinding, Severity
+
+#: Rules of `icheat check` that only warn, and that stop a publication all the same.
+_STALE = ("BakedStale", "BakedParametersChanged", "PaintedSurfaceChanged")
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ def _damage(stage: Any, keys: Sequence[PinnedKey]) -> list[Finding]:
                 read[place] = str(problem)
         if read[place]:
             at = "" if key.time is None else f" at time {key.time:g}"
-            findings.append(Finding(key.edit, f"icheat:payload{at}", read[place]))
+            findings.append(EditFinding(key.edit, f"icheat:payload{at}", read[place], Severity.ERROR))
     return findings
 
 
@@ -108,10 +112,10 @@ def _errors(stage: Any, keys: Sequence[PinnedKey]) -> list[Finding]:
     for time in times:
         try:
             for finding in inspection.check(stage, time):
-                if getattr(finding, "severity", "") == "error" or "stale" in f"{getattr(finding, 'rule', '')}".lower():
+                if getattr(finding, "severity", "") == Severity.ERROR or getattr(finding, "rule", "") in _STALE:
                     found[finding] = None
         except IcheatError as problem:
-            found[Finding("/", "check", str(problem))] = None
+            found[EditFinding("/", "check", str(problem), Severity.ERROR)] = None
     return list(found)
 
 
