@@ -131,9 +131,6 @@ over "World"
 def test_gc_finds_every_place_that_names_a_sidecar(place: str, how: str, shot: Path, tmp_path: Path) -> None:
     folder = shot.parent
     text = "#usda 1.0\n" + HIDDEN[place].replace("FOLDER", str(folder))
-    text = text.replace(
-        '"a" { over "Edits" { over "warm" { asset icheat:filePath = @./shot.v001.icheat.h5@; } } }', VARIANT
-    )
     _age(folder)
     assert len(housekeeping.collect([str(folder)]).unnamed) == 1
     if how == "beside":
