@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +16,7 @@ import pytest
 
 from icheat_usd.image.film import Film
 from icheat_usd.session import GatherSettings, Quality, Session
+from icheat_usd.stage import schema
 from tests.composition.reading import open_case
 from tests.composition.stages import SCENE, Case, layer, retimed, write_case, write_flat
 from tests.composition.test_composition import CASES
@@ -66,6 +72,48 @@ def test_both_renderers_show_what_one_layer_by_hand_shows(case: Case, folder: Pa
     assert_equal(films(retimed(composed, case.retimings[0]), scene), expected)
     acts = "stackEnabled = false" not in case.flat
     assert all(bool(np.any(film.layer("edit_delta"))) == acts for film in expected)
+
+
+#: Cases that ask most of a host without the schemas: list edits of collections, keys, variants, libraries, limits.
+UNREGISTERED = (
+    "a shot changes what an edit selects",
+    "a shot overrides one key",
+    "the day grade of a stack, chosen by the shot",
+    "a library's edits, referenced by the sequence and aimed by the shot",
+    "limits, lights and a target of a library follow the reference, the layers' times and the shot",
+)
+
+
+def digests(images: tuple[Film, Film]) -> list[str]:
+    """SHA-256 of all layers of both films."""
+    pixels = [b"".join(film.layer(name).tobytes() for name in sorted(film.layers)) for film in images]
+    return [hashlib.sha256(each).hexdigest() for each in pixels]
+
+
+def main() -> None:
+    """Print the digests of stages that standard input says how to open."""
+    print(json.dumps([schema.is_registered(), *(digests(films(opened)) for opened in json.load(sys.stdin))]))
+
+
+def test_a_host_that_composed_first_shows_the_same(folder: Path) -> None:
+    composed = [write_case(CASES[name], folder / f"late{index}") for index, name in enumerate(UNREGISTERED)]
+    code = (
+        "from pxr import Usd\nUsd.Stage.CreateInMemory().DefinePrim('/composed/before', 'Scope')\n"
+        "from tests.composition.test_images import main\nmain()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        input=json.dumps(composed),
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+        env={name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"},
+    )
+    assert done.returncode == 0, done.stderr
+    registered, *late = json.loads(done.stdout)
+    assert not registered
+    here = [digests(films(opened, _scene(folder, SCENE))) for opened in composed]
+    assert late == here and len({tuple(each) for each in here}) == len(UNREGISTERED)
 
 
 def test_what_the_images_share_is_what_each_stage_computes_for_itself(folder: Path) -> None:
