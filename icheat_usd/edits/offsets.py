@@ -17,7 +17,7 @@ from icheat_usd.edits.field import Aggregate, EditField, Ends
 from icheat_usd.scene import F32, F64, I64
 
 #: Pairs of receivers and gather samples evaluated at once.
-PAIRS_AT_ONCE = 1 << 19
+PAIRS_AT_ONCE = 1 << 17
 
 
 class OffsetCasters(NamedTuple):

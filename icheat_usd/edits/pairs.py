@@ -12,7 +12,7 @@ from icheat_usd.edits.offsets import OffsetCasters, offset_radiance
 from icheat_usd.scene import F32, I64
 
 #: Pairs evaluated at once; bounds memory and keeps the arrays of a step near the caches.
-PAIRS_AT_ONCE = 1 << 19
+PAIRS_AT_ONCE = 1 << 17
 
 
 class PairLight(NamedTuple):
@@ -114,10 +114,10 @@ def _parts(block: PairLight) -> Iterator[PairLight]:
         yield block
         return
     for begin in range(0, n, PAIRS_AT_ONCE):
-        some = np.arange(begin, min(begin + PAIRS_AT_ONCE, n))
+        some = slice(begin, begin + PAIRS_AT_ONCE)
         yield PairLight(
             block.owner[some],
-            block.casters.take(some),
+            block.casters.take(np.arange(n)[some]),
             block.seen[:, some],
             block.brought[:, some],
             block.emitted[some],

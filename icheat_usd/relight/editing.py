@@ -36,7 +36,7 @@ def edit_view(transport: Transport, lit: LitCasters, field: EditField, receivers
     light = np.take(indirect, receivers.samples, axis=0)
     for group in receivers.groups:
         shared = _SharedReceivers(transport, lit, field, receivers, group, offsets)
-        light[group.where] = shared.light() if group.last is None else shared.light_below() + shared.light_on_top()
+        light[group.where] = shared.light() if group.last is None else shared.light_with_last()
     for where in _chunks(transport, receivers):
         samples = receivers.samples[where]
         blocks = _blocks(transport, lit, receivers, samples)
@@ -67,32 +67,28 @@ class _SharedReceivers:
         self.ends = receivers.ends.take(group.where[:1])
         self.masks = None if group.last is None else receivers.ends.masks[field.rows_of(group.last)][:, group.where]
 
-    def light_below(self) -> F32:
-        """Light under the edits weaker than `last`."""
-        self.below = self.light(upto=self.last)
-        return self.below
-
-    def light_on_top(self) -> F32:
-        """What `last` changes, which is linear in its masks."""
+    def light_with_last(self) -> F32:
+        """Light where the samples differ in their masks of `last`, in which it is linear."""
         assert self.last is not None and self.masks is not None
         bound = self.field.edits[self.last]
         rows = self.field.rows_of(self.last)
-        change = np.zeros_like(self.below)
-        if bound.level is Level.AGGREGATE:
-            assert bound.edit.blend is Blend.COMPOSE
-            for key, row in enumerate(range(rows.start, rows.stop)):
+        below = self.light(upto=self.last)
+        result = below.copy()
+        for key, row in enumerate(range(rows.start, rows.stop)):
+            mask = self.masks[key][:, None]
+            if bound.level is Level.AGGREGATE:
+                assert bound.edit.blend is Blend.COMPOSE
                 aggregate = Aggregate(self.last, key, row)
                 seen = self.light(upto=self.last, aggregate=aggregate)
                 scale, added = self.field.resolve(aggregate, seen)
-                weight = np.float32(bound.edit.amount * bound.key_weights[key]) * self.masks[key]
-                change += weight[:, None] * ((scale - ONE) * seen + added)
-            return change
-        for key, row in enumerate(range(rows.start, rows.stop)):
-            masks = self.ends.masks.copy()
-            masks[rows] = 0
-            masks[row] = 1
-            change += self.masks[key][:, None] * (self.light(self.ends._replace(masks=masks)) - self.below)
-        return change
+                weight = np.float32(bound.edit.amount * bound.key_weights[key]) * mask
+                result += weight * ((scale - ONE) * seen + added)
+            else:
+                masks = self.ends.masks.copy()
+                masks[rows] = 0
+                masks[row] = 1
+                result += mask * (self.light(self.ends._replace(masks=masks)) - below)
+        return result
 
     def light(self, ends: Ends | None = None, upto: int | None = None, aggregate: Aggregate | None = None) -> F32:
         """Light of the samples under their masks, or under those of `ends`."""
@@ -140,7 +136,7 @@ def _rows_at(rows: SparseRows, interpolation: SparseRows | None, samples: I64, b
 
 
 def _chunks(transport: Transport, receivers: Receivers) -> Iterator[I64]:
-    """Positions of single samples, as many at once as have `PAIRS_AT_ONCE` pairs."""
+    """Positions of single samples, as many at once as have at most `PAIRS_AT_ONCE` pairs."""
     single = receivers.single
     if len(single) == 0:
         return
@@ -149,7 +145,7 @@ def _chunks(transport: Transport, receivers: Receivers) -> Iterator[I64]:
         for _, rows in _shared_columns(lobes):
             counts += _entry_counts(rows[0], transport.interpolation, receivers.samples[single])
     before = np.cumsum(counts) - counts
-    chunk = before // PAIRS_AT_ONCE
+    chunk = before // (PAIRS_AT_ONCE // 2)
     yield from np.split(single, np.flatnonzero(np.diff(chunk)) + 1)
 
 
