@@ -51,7 +51,8 @@ def _lines(found: Any) -> list[str]:
     ]
     if found.painted_surfaces:
         share = 100.0 * found.painted_texels / max(found.texels, 1)
-        rows.append(["painted", f"{found.painted_surfaces} surfaces, {found.texels:,} texels, {share:.0f} % above 0"])
+        surfaces = f"{found.painted_surfaces} surface{'s' * (found.painted_surfaces != 1)}"
+        rows.append(["painted", f"{surfaces}, {found.texels:,} texels, {share:.0f} % above 0"])
     if found.rows:
         rows.append(["sampled rows", f"{found.rows:,}"])
     lines = aligned(rows)

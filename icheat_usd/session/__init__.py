@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from icheat_usd.edits.painting import soft_sphere
     from icheat_usd.final_gather import GatherSettings
     from icheat_usd.session.authoring import add_edit, create_stack, move_edit, mute_edit, remove_edit, set_edit
+    from icheat_usd.session.differences import compare_stages
     from icheat_usd.session.document import Session
+    from icheat_usd.session.explain import contribution_film, explain_pixel
+    from icheat_usd.session.inspection import check
     from icheat_usd.session.quality import DRAFT, Quality
 
 __all__ = [
@@ -27,7 +30,11 @@ __all__ = [
     "Quality",
     "Session",
     "add_edit",
+    "check",
+    "compare_stages",
+    "contribution_film",
     "create_stack",
+    "explain_pixel",
     "move_edit",
     "mute_edit",
     "remove_edit",
@@ -36,6 +43,10 @@ __all__ = [
 ]
 
 _HOMES = {
+    "check": "icheat_usd.session.inspection",
+    "compare_stages": "icheat_usd.session.differences",
+    "contribution_film": "icheat_usd.session.explain",
+    "explain_pixel": "icheat_usd.session.explain",
     "soft_sphere": "icheat_usd.edits.painting",
     "GatherSettings": "icheat_usd.final_gather",
     "Session": "icheat_usd.session.document",

@@ -12,8 +12,10 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from icheat_usd.edits import operations
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.model import Edit, EditStack
+from icheat_usd.edits.operations.base import Level
 from icheat_usd.errors import EditError
 from icheat_usd.image.film import Film
 from icheat_usd.relight import Relighter, build_relighter
@@ -151,7 +153,14 @@ class _PixelLight:
         return float(of_sample @ part / max(float(part.sum()), 1e-30))
 
     def casters(self, stack: EditStack, edit: Edit, n: int) -> tuple[CasterShare, ...]:
-        """What the edit changes from each caster alone, the largest change first."""
+        """What the edit changes from each caster alone, the largest change first.
+
+        Nothing for edits of all light, which have no casters. Those of the light of all casters together change it
+        by more or less than the sum of what they change from each.
+        """
+        operation = operations.find(edit.operation)
+        if operation is not None and operation.level is Level.VIEW:
+            return ()
         without = self.light(_without(stack, edit))[2]
         found = []
         for path in self._brightest(edit):
