@@ -10,15 +10,12 @@ those of weaker layers, and an explicit list would cut them off.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from pxr import Sdf, Usd
 
-from icheat_usd.edits import operations
 from icheat_usd.edits.model import Blend, Value
 from icheat_usd.errors import EditError
 from icheat_usd.stage import collections, schema
@@ -31,6 +28,7 @@ from icheat_usd.stage.layers import reload_layer as reload_layer
 from icheat_usd.stage.layers import remember_layer as remember_layer
 from icheat_usd.stage.layers import save_layer as save_layer
 from icheat_usd.stage.layers import writing as writing
+from icheat_usd.stage.parameter_authoring import checked_blend, set_amount, set_operation, set_value
 from icheat_usd.stage.selection_authoring import Members as Members
 from icheat_usd.stage.selection_authoring import add_region as add_region
 from icheat_usd.stage.selection_authoring import add_selection as add_selection
@@ -152,11 +150,11 @@ def add_edit(
             raise EditError(f"{path} exists already; choose another name or set its values")
         edit = stage.DefinePrim(path, "Scope")
         apply_schema(edit, schema.EDIT_API)
-        _set_operation(edit, operation, parameters or {}, time, has_payload=payload is not None)
+        set_operation(edit, operation, parameters or {}, time, has_payload=payload is not None)
         if amount != schema.fallback(schema.AMOUNT):
-            _set_amount(edit, amount, time)
-        if _checked_blend(blend) != schema.fallback(schema.BLEND):
-            _set(edit, schema.BLEND, _checked_blend(blend))
+            set_amount(edit, amount, time)
+        if checked_blend(blend) != schema.fallback(schema.BLEND):
+            set_value(edit, schema.BLEND, checked_blend(blend))
         for collection, members in ((schema.RECEIVERS, receivers), (schema.CASTERS, casters)):
             # Always authored, so that a host without our schemas selects the same.
             Usd.CollectionAPI(edit, collection).CreateIncludeRootAttr().Set(False)
@@ -333,17 +331,17 @@ def set_edit(
         if operation is not None or parameters:
             token = operation or str(schema.read_attribute(prim, schema.OPERATION, time))
             has_payload = strongest_opinion(prim.GetAttribute(schema.PAYLOAD)) is not None
-            written += _set_operation(
+            written += set_operation(
                 prim, token, parameters or {}, time, has_payload=has_payload, write_token=operation is not None
             )
         if amount is not None:
-            _set_amount(prim, amount, time)
+            set_amount(prim, amount, time)
             written.append(schema.AMOUNT)
         if blend is not None:
-            _set(prim, schema.BLEND, _checked_blend(blend))
+            set_value(prim, schema.BLEND, checked_blend(blend))
             written.append(schema.BLEND)
         if enabled is not None:
-            _set(prim, schema.ENABLED, bool(enabled))
+            set_value(prim, schema.ENABLED, bool(enabled))
             written.append(schema.ENABLED)
         for collection, members in ((schema.RECEIVERS, receivers), (schema.CASTERS, casters)):
             if members is not None and not set_members(prim, collection, members):
@@ -391,98 +389,3 @@ def _relationship(prim: Usd.Prim, name: str) -> Usd.Relationship:
 
 def _append(relationship: Usd.Relationship, path: Sdf.Path) -> None:
     relationship.AddTarget(path, Usd.ListPositionBackOfAppendList)
-
-
-def _set(prim: Usd.Prim, name: str, value: Any, time: float | None = None) -> None:
-    attribute = prim.GetAttribute(name)
-    attribute.Set(value, Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
-
-
-def _set_amount(prim: Usd.Prim, amount: float, time: float | None) -> None:
-    if isinstance(amount, bool) or not isinstance(amount, (int, float)) or not math.isfinite(amount):
-        raise EditError(f"{prim.GetPath()}: amount is {amount!r}, expected a finite number")
-    _set(prim, schema.AMOUNT, float(amount), time)
-
-
-def _checked_blend(blend: Blend | str) -> str:
-    if blend not in list(Blend):
-        raise EditError(f"no blend is called '{blend}'; there are {', '.join(b.value for b in Blend)}")
-    return Blend(blend).value
-
-
-def _set_operation(
-    prim: Usd.Prim,
-    operation: str,
-    parameters: Mapping[str, Value],
-    time: float | None,
-    *,
-    has_payload: bool,
-    write_token: bool = True,
-) -> list[str]:
-    known = schema.operations()
-    found = known.get(operation)
-    if found is None and (parameters or not has_payload):
-        raise EditError(
-            f"{prim.GetPath()}: no operation is called '{operation}'; there are {', '.join(sorted(known))} "
-            f"(another one needs its schema on PXR_PLUGINPATH_NAME, or a baked payload and no parameters)"
-        )
-    written = [schema.OPERATION] if write_token else []
-    if write_token:
-        _set(prim, schema.OPERATION, operation)
-    if found is None:
-        return written
-    apply_schema(prim, found.api_schema)
-    checked = {}
-    for name, value in parameters.items():
-        parameter = found.parameters.get(name)
-        if parameter is None:
-            listed = ", ".join(sorted(found.parameters))
-            raise EditError(f"{prim.GetPath()}: operation '{operation}' has no parameter '{name}'; it has {listed}")
-        checked[name] = _checked_value(prim, parameter, value)
-    _check_together(prim, found, checked, time)
-    for name, value in checked.items():
-        _set(prim, found.parameters[name].name, value, time)
-        written.append(found.parameters[name].name)
-    return written
-
-
-def _check_together(
-    prim: Usd.Prim, operation: schema.OperationSchema, given: Mapping[str, Any], time: float | None
-) -> None:
-    """Let the operation check what is given with what is there: it may know bounds that no schema can state."""
-    implementation = operations.find(operation.name)
-    if implementation is None or not given:
-        return
-    parameters = {}
-    for known in implementation.parameters:
-        parameter = operation.parameters.get(known.name)
-        if parameter is not None:
-            value = given.get(known.name, schema.read_attribute(prim, parameter.name, time))
-            converted = None if value is None else schema.to_value(value)
-            if converted is not None:
-                parameters[known.name] = converted
-    implementation.complete(parameters, str(prim.GetPath()))
-
-
-def _checked_value(prim: Usd.Prim, parameter: schema.PropertySchema, value: Value) -> Any:
-    """The value in the form that USD takes for the parameter's type."""
-    expected = parameter.fallback
-    assert parameter.type_name is not None
-    size = len(expected) if not isinstance(expected, str) and hasattr(expected, "__len__") else 0
-    error = EditError(
-        f"{prim.GetPath()}: {parameter.name} is {value!r}, expected {parameter.type_name} such as {expected}"
-    )
-    if isinstance(expected, (bool, str)):
-        if not isinstance(value, type(expected)):
-            raise error
-        return value
-    if not size and not isinstance(expected, (int, float)):
-        return value  # A third party's type: USD says whether it fits.
-    numbers = tuple(value) if isinstance(value, (tuple, list)) else (value,)
-    if any(isinstance(n, (bool, str)) or not isinstance(n, (int, float)) or not math.isfinite(n) for n in numbers):
-        raise error
-    if parameter.type_name.isArray:
-        return type(expected)(numbers)
-    if len(numbers) != max(size, 1) or bool(size) != isinstance(value, (tuple, list)):
-        raise error
-    return type(expected)(*numbers)

@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 
 from icheat_usd.errors import SidecarError
-from tests.composition import cases_of_arcs, cases_of_layers
+from tests.composition import cases_in_time, cases_of_arcs, cases_of_layers
 from tests.composition.reading import open_case, read_case
 from tests.composition.stages import Case, retimed, write_case, write_flat
 
-CASES = {case.name: case for case in (*cases_of_layers.CASES, *cases_of_arcs.CASES)}
+CASES = {case.name: case for case in (*cases_of_layers.CASES, *cases_of_arcs.CASES, *cases_in_time.CASES)}
 
 
 @pytest.fixture(scope="module")
