@@ -198,14 +198,25 @@ class EditField:
 
     def receivers(self, points: SurfacePoints) -> Ends:
         """The points as receivers."""
-        masks = [selection.at(points) for bound in self.edits for selection in bound.receivers]
-        located = [rows.locate_receivers(points) for bound in self.edits for rows in bound.rows if rows is not None]
+        masks, located = [], []
+        for bound in self.edits:
+            for selection, rows in zip(bound.receivers, bound.rows, strict=True):
+                masks.append(selection.at(points))
+                if rows is not None:
+                    located.append(rows.locate_receivers(points))
+                    # Where no row holds nothing is edited, to the bit.
+                    masks[-1] *= (located[-1].rows >= 0).any(axis=1)
         return _ends(masks, located, points, self.uses_receiver)
 
     def casters(self, points: SurfacePoints) -> Ends:
         """The points as casters."""
-        masks = [selection.at(points) for bound in self.edits for selection in bound.casters]
-        located = [rows.locate_casters(points) for bound in self.edits for rows in bound.rows if rows is not None]
+        masks, located = [], []
+        for bound in self.edits:
+            for selection, rows in zip(bound.casters, bound.rows, strict=True):
+                masks.append(selection.at(points))
+                if rows is not None:
+                    located.append(rows.locate_casters(points))
+                    masks[-1] *= located[-1] >= 0
         return _ends(masks, located, points, self.uses_receiver or self.uses_caster)
 
     def receiver_masks(self, points: SurfacePoints) -> F32:
