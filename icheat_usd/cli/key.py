@@ -19,6 +19,7 @@ from icheat_usd.cli.options import (
     add_layer,
     add_stack,
     add_stage,
+    add_variant,
     assignment,
     finding_as_json,
     finding_as_text,
@@ -72,6 +73,7 @@ def _verb(
     parser.add_argument("--camera", metavar="PRIM", help="camera whose stack is meant")
     if frame:
         add_layer(parser)
+        add_variant(parser)
         parser.add_argument("--frame", type=float, required=name != "set", metavar="T", help=frame)
     add_json(parser)
     parser.set_defaults(command=command)
@@ -89,11 +91,13 @@ def set_command(options: argparse.Namespace) -> int:
     if options.frame is None:
         if options.set or options.identity or any(spheres.values()) or options.interpolation is None:
             raise EditError("a key needs its time: give --frame, or --interpolation alone")
-        findings = keys.set_interpolation(stage, edit, layer=layer, interpolation=options.interpolation)
+        findings = keys.set_interpolation(
+            stage, edit, layer=layer, interpolation=options.interpolation, variant=options.variant
+        )
         return _report(options, edit, layer, findings)
     values: dict[str, Any] = {"layer": layer, "frame": options.frame, "parameters": dict(options.set or ())}
     values |= {"identity": options.identity, "interpolation": options.interpolation}
-    values |= {"sidecar": options.sidecar, "why": options.why}
+    values |= {"sidecar": options.sidecar, "why": options.why, "variant": options.variant}
     if any(spheres.values()):
         # Painting needs the scene as it is at the key's frame; other keys work in a host without the kernels.
         from icheat_usd.cli.edit import brush
@@ -111,7 +115,8 @@ def copy_command(options: argparse.Namespace) -> int:
 
     stage, layer = open_for_writing(options)
     _, edit = named_edit(stage, options)
-    findings = keys.copy_key(stage, edit, layer=layer, frame=options.source, to=options.frame)
+    place: dict[str, Any] = {"layer": layer, "variant": options.variant}
+    findings = keys.copy_key(stage, edit, frame=options.source, to=options.frame, **place)
     return _report(options, edit, layer, findings)
 
 
@@ -121,7 +126,8 @@ def remove_command(options: argparse.Namespace) -> int:
 
     stage, layer = open_for_writing(options)
     _, edit = named_edit(stage, options)
-    return _report(options, edit, layer, keys.remove_key(stage, edit, layer=layer, frame=options.frame))
+    findings = keys.remove_key(stage, edit, layer=layer, frame=options.frame, variant=options.variant)
+    return _report(options, edit, layer, findings)
 
 
 def list_command(options: argparse.Namespace) -> int:

@@ -22,6 +22,7 @@ from icheat_usd.stage.edit_stack import anchor_path, open_asset
 from icheat_usd.stage.keys import SAME_TIME, Key, read_keys, strongest_opinion
 from icheat_usd.stage.parameters import authored_parameters, mix_parameters
 from icheat_usd.stage.stacks import EditFinding, edit_prim
+from icheat_usd.stage.variants import selected_variant
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ def set_key(
     made_against: Mapping[str, str | float | int] | None = None,
     sidecar: str | Path | None = None,
     why: str = "",
+    variant: tuple[str, str] | None = None,
 ) -> tuple[Finding, ...]:
     """Set one keyframe and save the layer. What is not given is as it is at that frame.
 
@@ -96,6 +98,8 @@ def set_key(
         What happens between all keys of the edit.
     sidecar : path, optional
         Folder or file for the payload; beside the layer's file by default.
+    variant : (str, str), optional
+        Variant set and variant to write into.
 
     Returns
     -------
@@ -113,31 +117,63 @@ def set_key(
         if parameters or receiver_mask is not None or caster_mask is not None:
             raise EditError(f"{edit}: an identity key has no parameters and no masks; leave them out")
         findings = key_authoring.set_payload_key(
-            stage, edit, layer=target, time=frame, payload=None, interpolation=interpolation
+            stage, edit, layer=target, time=frame, payload=None, interpolation=interpolation, variant=variant
         )
         _save(target)
         return findings
-    made = _Made(stage, edit, frame, dict(parameters or {}))
-    kept = made.unchanged_payload() if receiver_mask is None and caster_mask is None else None
-    masks = (receiver_mask, caster_mask)
-    payloads = {} if kept else {frame: made.payload(masks, made_against or {}), **made.other_payloads()}
+    with selected_variant(stage, edit, variant):
+        return _set_payloads(
+            _Made(stage, edit, frame, dict(parameters or {})),
+            frame,
+            (receiver_mask, caster_mask),
+            target,
+            made_against or {},
+            interpolation,
+            sidecar,
+            why,
+            variant,
+        )
+
+
+def _set_payloads(
+    made: _Made,
+    frame: float,
+    masks: tuple[SurfaceMask | None, SurfaceMask | None],
+    target: Any,
+    made_against: Mapping[str, str | float | int],
+    interpolation: str | None,
+    sidecar: str | Path | None,
+    why: str,
+    variant: tuple[str, str] | None,
+) -> tuple[Finding, ...]:
+    stage, edit = made.prim.GetStage(), str(made.prim.GetPath())
+    kept = made.unchanged_payload() if masks == (None, None) else None
+    payloads = {} if kept else {frame: made.payload(masks, made_against), **made.other_payloads()}
     file: Path | None = None
     try:
         named: dict[float, tuple[str | Path, str]] = {frame: kept} if kept else {}
         if payloads:
             beside = sidecar or target.realPath
             if not beside:
-                raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
+                raise EditError(
+                    f"layer '{target.identifier}' has no file to put a sidecar beside; name one with --sidecar"
+                )
             history = history_entry(why, edit)
             file, digests = write_payloads(beside, payloads.values(), anchor=anchor_path(made.prim), history=history)
             named = {time: (file, digest) for time, digest in zip(payloads, digests, strict=True)}
-        with layers.writing(stage, target, edit):
-            findings = ()
+        with layers.writing(stage, target, edit, variant):
+            findings: tuple[Finding, ...] = ()
             for time, payload in named.items():
                 findings = key_authoring.set_payload_key(
-                    stage, edit, layer=target, time=time, payload=payload, interpolation=interpolation
+                    stage,
+                    edit,
+                    layer=target,
+                    time=time,
+                    payload=payload,
+                    interpolation=interpolation,
+                    variant=variant,
                 )
-            released = key_authoring.release_parameters(stage, edit, made.released(), layer=target)
+            released = key_authoring.release_parameters(stage, edit, made.released(), layer=target, variant=variant)
             _save(target)
     except Exception:
         # Not after an interruption: the layer may have been saved already, and then names this file.
@@ -147,33 +183,39 @@ def set_key(
     return tuple(dict.fromkeys((*findings, *released, *made.findings)))
 
 
-def copy_key(stage: Any, edit: str, *, layer: str, frame: float, to: float) -> tuple[Finding, ...]:
+def copy_key(
+    stage: Any, edit: str, *, layer: str, frame: float, to: float, variant: tuple[str, str] | None = None
+) -> tuple[Finding, ...]:
     """Let the payload of the key at `frame` hold at `to` too, and save the layer."""
     target = layers.find_layer(stage, layer)
-    findings = key_authoring.copy_payload_key(stage, edit, layer=target, time=frame, to=to)
+    findings = key_authoring.copy_payload_key(stage, edit, layer=target, time=frame, to=to, variant=variant)
     _save(target)
     return findings
 
 
-def remove_key(stage: Any, edit: str, *, layer: str, frame: float) -> tuple[Finding, ...]:
+def remove_key(
+    stage: Any, edit: str, *, layer: str, frame: float, variant: tuple[str, str] | None = None
+) -> tuple[Finding, ...]:
     """Take the key at `frame` out and save the layer; the only key stays, see `stage.key_authoring`."""
     target = layers.find_layer(stage, layer)
-    findings = key_authoring.remove_payload_key(stage, edit, layer=target, time=frame)
+    findings = key_authoring.remove_payload_key(stage, edit, layer=target, time=frame, variant=variant)
     _save(target)
     return findings
 
 
-def set_interpolation(stage: Any, edit: str, *, layer: str, interpolation: str) -> tuple[Finding, ...]:
+def set_interpolation(
+    stage: Any, edit: str, *, layer: str, interpolation: str, variant: tuple[str, str] | None = None
+) -> tuple[Finding, ...]:
     """Set what happens between the keys and save the layer."""
     target = layers.find_layer(stage, layer)
-    findings = key_authoring.set_key_interpolation(stage, edit, layer=target, interpolation=interpolation)
+    findings = key_authoring.set_key_interpolation(
+        stage, edit, layer=target, interpolation=interpolation, variant=variant
+    )
     _save(target)
     return findings
 
 
-def payload_at(
-    stage: Any, edit: str, frame: float | None, made_against: Mapping[str, str | float | int]
-) -> Payload:
+def payload_at(stage: Any, edit: str, frame: float | None, made_against: Mapping[str, str | float | int]) -> Payload:
     """What an edit says at a frame as one payload: recipe, with what is authored over it, and masks.
 
     Raises
@@ -278,7 +320,9 @@ class _Made:
             for mask, _ in painted
         )
         if heaviest is None or not alike:
-            message = f"the keys around frame {self.frame or 0.0:g} cover other surfaces; that of the nearer key is taken"
+            message = (
+                f"the keys around frame {self.frame or 0.0:g} cover other surfaces; that of the nearer key is taken"
+            )
             self.findings.append(EditFinding(str(self.prim.GetPath()), side.replace("_", " "), message))
             return heaviest
         total = sum(weight for _, weight in painted)

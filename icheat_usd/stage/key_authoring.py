@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pxr import Sdf, Usd
@@ -20,6 +21,9 @@ from icheat_usd.stage.keys import (
 )
 from icheat_usd.stage.layers import asset_path, overridden_opinions, spec_path, writable_edit, writing
 from icheat_usd.stage.stacks import EditFinding
+from icheat_usd.stage.variants import selected_variant
+
+Variant = tuple[str, str] | None
 
 #: customData of icheat:payload in a layer that copied another layer's keys: where they came from.
 COPIED_FROM = "icheatCopiedFrom"
@@ -33,6 +37,7 @@ def set_payload_key(
     time: float | None,
     payload: tuple[str | Path, str] | None,
     interpolation: str | None = None,
+    variant: Variant = None,
 ) -> tuple[EditFinding, ...]:
     """Author the payload of one keyframe.
 
@@ -49,6 +54,8 @@ def set_payload_key(
         (file, digest), or None for the identity.
     interpolation
         ``"linear"``, ``"smooth"`` or ``"held"``; None leaves it.
+    variant
+        (set, variant) to write into, as for the other functions here; another one may be selected.
 
     Raises
     ------
@@ -56,8 +63,7 @@ def set_payload_key(
         There is no such edit, or its composed keys cannot be copied.
     """
     _check_interpolation(edit, interpolation)
-    prim = writable_edit(stage, edit)
-    with writing(stage, layer, prim.GetPath()) as target:
+    with _writing_edit(stage, edit, layer, variant) as (prim, target):
         if time is None:
             _clear_keys(prim, target)
         else:
@@ -66,10 +72,12 @@ def set_payload_key(
         write_key(prim, target, time, asset, payload[1] if payload is not None else "")
         if interpolation is not None:
             prim.GetAttribute(schema.KEY_INTERPOLATION).Set(interpolation)
-    return overridden_opinions(prim, target, (schema.PAYLOAD, schema.FILE_PATH), time)
+        return overridden_opinions(prim, target, (schema.PAYLOAD, schema.FILE_PATH), time)
 
 
-def remove_payload_key(stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, time: float) -> tuple[EditFinding, ...]:
+def remove_payload_key(
+    stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, time: float, variant: Variant = None
+) -> tuple[EditFinding, ...]:
     """Take one keyframe out; if another layer decides the keys, the others are copied to `layer` first.
 
     Raises
@@ -77,23 +85,22 @@ def remove_payload_key(stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, t
     EditError
         There is no such edit or key, or it is the only key: without it the edit would lose its masks.
     """
-    prim = writable_edit(stage, edit)
-    key = key_at(prim, time)
-    track = read_keys(prim)
-    if track is None or len(track.times) < 2:
-        raise EditError(
-            f"{prim.GetPath()}: its only key is at {time:g}, and without it the edit would lose what was painted; "
-            f"make the key an identity, mute the edit or remove it"
-        )
-    with writing(stage, layer, prim.GetPath()) as target:
+    with _writing_edit(stage, edit, layer, variant) as (prim, target):
+        key = key_at(prim, time)
+        track = read_keys(prim)
+        if track is None or len(track.times) < 2:
+            raise EditError(
+                f"{prim.GetPath()}: its only key is at {time:g}, and without it the edit would lose what was painted; "
+                f"make the key an identity, mute the edit or remove it"
+            )
         _own_keys(prim, target)
         for name in (schema.PAYLOAD, schema.FILE_PATH):
             _erase_sample(prim, target, name, float(key.time or 0.0))
-    return overridden_opinions(prim, target, (schema.PAYLOAD, schema.FILE_PATH), time)
+        return overridden_opinions(prim, target, (schema.PAYLOAD, schema.FILE_PATH), time)
 
 
 def copy_payload_key(
-    stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, time: float, to: float
+    stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, time: float, to: float, variant: Variant = None
 ) -> tuple[EditFinding, ...]:
     """Let the payload of the key at `time` hold at `to` too.
 
@@ -102,13 +109,14 @@ def copy_payload_key(
     EditError
         There is no such edit or key.
     """
-    key = key_at(writable_edit(stage, edit), time)
-    payload = (key.anchored, key.digest) if key.digest else None
-    return set_payload_key(stage, edit, layer=layer, time=to, payload=payload)
+    with selected_variant(stage, edit, variant):
+        key = key_at(writable_edit(stage, edit), time)
+        payload = (key.anchored, key.digest) if key.digest else None
+        return set_payload_key(stage, edit, layer=layer, time=to, payload=payload, variant=variant)
 
 
 def set_key_interpolation(
-    stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, interpolation: str
+    stage: Usd.Stage, edit: str, *, layer: str | Sdf.Layer, interpolation: str, variant: Variant = None
 ) -> tuple[EditFinding, ...]:
     """Author what happens between the keys: ``"linear"``, ``"smooth"`` or ``"held"``.
 
@@ -118,14 +126,13 @@ def set_key_interpolation(
         There is no such edit or interpolation.
     """
     _check_interpolation(edit, interpolation)
-    prim = writable_edit(stage, edit)
-    with writing(stage, layer, prim.GetPath()) as target:
+    with _writing_edit(stage, edit, layer, variant) as (prim, target):
         prim.GetAttribute(schema.KEY_INTERPOLATION).Set(interpolation)
-    return overridden_opinions(prim, target, (schema.KEY_INTERPOLATION,), None)
+        return overridden_opinions(prim, target, (schema.KEY_INTERPOLATION,), None)
 
 
 def release_parameters(
-    stage: Usd.Stage, edit: str, names: Iterable[str], *, layer: str | Sdf.Layer
+    stage: Usd.Stage, edit: str, names: Iterable[str], *, layer: str | Sdf.Layer, variant: Variant = None
 ) -> tuple[EditFinding, ...]:
     """Let keys decide parameters that have been authored for all times, as far as `layer` can.
 
@@ -141,22 +148,31 @@ def release_parameters(
     tuple of EditFinding
         Parameters that a stronger layer goes on deciding.
     """
-    prim = writable_edit(stage, edit)
-    with writing(stage, layer, prim.GetPath()) as target:
+    findings = []
+    with _writing_edit(stage, edit, layer, variant) as (prim, target):
         for name in names:
-            spec = target.GetAttributeAtPath(prim.GetPath().AppendProperty(name))
-            if spec:
-                del target.GetPrimAtPath(prim.GetPath()).properties[name]
+            own = spec_path(stage, prim.GetPath().AppendProperty(name))
+            if target.GetAttributeAtPath(own):
+                del target.GetPrimAtPath(own.GetPrimPath()).properties[name]
             attribute = prim.GetAttribute(name)
             if attribute and attribute.HasAuthoredValue():
                 attribute.Block()
-    findings = []
-    for name in names:
-        opinion = strongest_opinion(prim.GetAttribute(name))
-        if opinion is not None and not opinion.is_blocked:
-            message = f"{opinion.layer.identifier} decides it at all times, so that keys do not; clear it there"
-            findings.append(EditFinding(str(prim.GetPath()), name, message))
+            opinion = strongest_opinion(prim.GetAttribute(name))
+            if opinion is not None and not opinion.is_blocked:
+                message = f"{opinion.layer.identifier} decides it at all times, so that keys do not; clear it there"
+                findings.append(EditFinding(str(prim.GetPath()), name, message))
     return tuple(findings)
+
+
+@contextmanager
+def _writing_edit(
+    stage: Usd.Stage, edit: str, layer: str | Sdf.Layer, variant: Variant
+) -> Iterator[tuple[Usd.Prim, Sdf.Layer]]:
+    """An edit's prim and the layer to write to, with the variant selected that may alone have the edit."""
+    with selected_variant(stage, edit, variant):
+        prim = writable_edit(stage, edit)
+        with writing(stage, layer, prim.GetPath(), variant) as target:
+            yield prim, target
 
 
 def key_at(prim: Usd.Prim, time: float) -> Key:
@@ -222,8 +238,11 @@ def copied_keys_are_current(prim: Usd.Prim) -> tuple[str, bool] | None:
         return None
     identifier = Sdf.ComputeAssetPathRelativeToLayer(opinion.layer, str(note.get("layer", "")))
     for spec, offset in prim.GetAttribute(schema.PAYLOAD).GetPropertyStackWithLayerOffsets(schema.time_code(None)):
+        # A class or a variant may have copied keys within one layer.
+        is_source = (spec.layer, spec.path) != (opinion.layer, opinion.path)
         if (
-            identifier in (spec.layer.identifier, spec.layer.realPath)
+            is_source
+            and identifier in (spec.layer.identifier, spec.layer.realPath)
             and spec.layer.GetNumTimeSamplesForPath(spec.path) > 0
         ):
             samples = [

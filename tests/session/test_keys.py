@@ -257,3 +257,30 @@ def test_a_mesh_that_was_rebuilt_keeps_its_painted_edit_and_is_a_finding(stage: 
     # Texels lie 1/16 apart, and the weights fall by 2.1 a metre at most.
     np.testing.assert_allclose(carried.texels[-len(anew) :], anew, atol=0.5 * np.sqrt(2) / 16 * 2.2)
     assert anew.min() == 0.0 and anew.max() > 0.8
+
+
+def test_keys_of_a_variant_are_written_into_it_and_leave_the_others(stage: Usd.Stage) -> None:
+    sequence = layer(stage, "seq.usda")
+    alone = Usd.Stage.Open(sequence)
+    grades = alone.GetPrimAtPath(STACK).GetVariantSets().AddVariantSet("grade")
+    for name in ("day", "dusk"):
+        grades.AddVariant(name)
+    grades.SetVariantSelection("day")
+    sequence.Save()
+    # Where opinions beside the variant exist they are stronger, so that the variant cannot decide.
+    assert keys.set_key(stage, WARM, layer="seq.usda", frame=5, parameters={"gain": 3.0}, variant=("grade", "dusk"))
+    fresh = open_stage(stage.GetRootLayer().realPath)
+    authoring.add_edit(
+        fresh, STACK, "cool", layer="seq.usda", receivers=["floor"], casters=["Room"], variant=("grade", "dusk")
+    )
+    cool, dusk = f"{STACK}/cool", ("grade", "dusk")
+    for frame, gain in ((1.0, 2.0), (11.0, 4.0)):
+        assert not keys.set_key(fresh, cool, layer="seq.usda", frame=frame, parameters={"gain": gain}, variant=dusk)
+    assert not keys.copy_key(fresh, cool, layer="seq.usda", frame=11, to=21, variant=dusk)
+    assert not keys.remove_key(fresh, cool, layer="seq.usda", frame=11, variant=dusk)
+    assert not keys.set_interpolation(fresh, cool, layer="seq.usda", interpolation="smooth", variant=dusk)
+    assert not fresh.GetPrimAtPath(cool)  # day is still selected
+    fresh.GetPrimAtPath(STACK).GetVariantSets().SetSelection("grade", "dusk")
+    listed = keys.list_keys(fresh, cool)
+    assert [key.time for key in listed.keys] == [1.0, 21.0] and listed.interpolation == "smooth"
+    assert not listed.copied_from
