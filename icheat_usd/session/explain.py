@@ -55,7 +55,7 @@ class EditShare:
     mask: float  #: mean receiver mask of what the pixel shows, 0..1
     casters: tuple[CasterShare, ...]  #: by changed light, largest first
     layers: Mapping[str, tuple[object, str]]  #: value and the layer that decides it, by name; authored ones
-    note: str = ""  #: why it takes no part: "muted", "amount 0", "inactive"
+    note: str = ""  #: why it takes no part: "muted", "amount 0", "the stack is off"
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,9 @@ def explain_pixel(session: Session, x: int, y: int, *, n_casters: int = 5, rays:
         assert lit is not None
         change = base[2] - lit.light(_without(stack, edit))[2]
         casters = lit.casters(stack, edit, n_casters) if change.any() else ()
-        shares[edit.path] = _share(session, edit, _rgb(change), lit.mask(edit), casters)
-    edits = tuple(shares.get(edit.path) or _share(session, edit, (0.0, 0.0, 0.0), 0.0, ()) for edit in stack.edits)
+        shares[edit.path] = _share(session, edit, _rgb(change), lit.mask(edit), casters, True)
+    none = (0.0, 0.0, 0.0), 0.0, ()
+    edits = tuple(shares.get(edit.path) or _share(session, edit, *none, stack.enabled) for edit in stack.edits)
     return PixelExplanation(
         x,
         y,
@@ -218,9 +219,12 @@ def _without(stack: EditStack, edit: Edit) -> EditStack:
     return replace(stack, edits=tuple(other for other in stack.edits if other is not edit))
 
 
-def _share(session: Session, edit: Edit, change: Color, mask: float, casters: tuple[CasterShare, ...]) -> EditShare:
+def _share(
+    session: Session, edit: Edit, change: Color, mask: float, casters: tuple[CasterShare, ...], is_on: bool
+) -> EditShare:
     described = describe_edit(session.stage, edit.path, session.frame)
     note = "" if edit.is_active else ("muted" if not edit.enabled else "amount 0")
+    note = note if is_on else "the stack is off"
     return EditShare(edit.path, edit.operation, change, mask, casters, _deciding(described), note)
 
 

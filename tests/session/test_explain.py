@@ -79,6 +79,12 @@ def test_a_pixel_that_no_edit_reaches_says_so(session):
     assert found.touching == () and found.indirect == found.indirect_edited
 
 
+def test_a_stack_that_is_off_explains_nothing(session):
+    session.stage.GetPrimAtPath("/World/Edits").GetAttribute("icheat:stackEnabled").Set(False)
+    found = explain_pixel(session, 12, 9)
+    assert found.touching == () and [share.note for share in found.edits] == ["the stack is off"] * 3
+
+
 @pytest.mark.parametrize("pixel", [(24, 0), (0, 18), (-1, 0)])
 def test_a_pixel_outside_the_image_is_refused(session, pixel):
     with pytest.raises(EditError, match="24 x 18 pixels, from 0 0 to 23 17"):

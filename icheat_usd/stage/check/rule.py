@@ -12,7 +12,6 @@ from pxr import Sdf, Usd
 from icheat_usd.edits.facts import Facts, facts, selection_facts
 from icheat_usd.edits.model import Edit, Payload
 from icheat_usd.errors import IcheatError
-from icheat_usd.scene import SceneSnapshot
 from icheat_usd.stage import collections, schema
 from icheat_usd.stage.edit_stack import PayloadReader, anchor_path, open_asset
 from icheat_usd.stage.keys import Key, read_keys
@@ -23,7 +22,7 @@ from icheat_usd.stage.stacks import Severity, listed_edits, targets
 
 @dataclass(frozen=True)
 class Context:
-    """What rules look at. Payloads and scenes are read when a rule first asks, and kept."""
+    """What rules look at. Payloads and facts about scenes are read when a rule first asks, and kept."""
 
     stage: Usd.Stage
     time: float | None
@@ -33,8 +32,7 @@ class Context:
     read_payload: PayloadReader | None = None
     listed: frozenset[str] = field(default=frozenset())  #: paths of edits that some stack lists
     _payloads: dict[tuple[str, str, str], Payload | IcheatError] = field(default_factory=dict)
-    _scenes: dict[tuple[object, ...], SceneSnapshot] = field(default_factory=dict)
-    _facts: dict[tuple[object, ...], Facts] = field(default_factory=dict)
+    _facts: dict[tuple[object, ...], tuple[Facts, frozenset[str]]] = field(default_factory=dict)
 
     def payload(self, prim: Usd.Prim, key: Key) -> Payload | None:
         """The payload of a key; None where nothing was given to read it with.
@@ -86,19 +84,17 @@ class Context:
 
         anchor = anchor_path(prim)
         camera, size = self._camera(anchor, then)
-        scene, seen = (time, camera, *size), (time, anchor, camera, *size)
+        seen = (time, anchor, camera, *size)
         try:
-            if scene not in self._scenes:
+            if seen not in self._facts:
                 width, height = size
                 shot = take_snapshot(self.stage, camera=camera or AUTO_CAMERA, time=time, width=width, height=height)
-                self._scenes[scene] = shot
-            snapshot = self._scenes[scene]
-            if seen not in self._facts:
-                self._facts[seen] = facts(snapshot, anchor, limit=False)
-            selected = selected_by(prim, time, frozenset(surface.path for surface in snapshot.surfaces))
+                paths = frozenset(surface.path for surface in shot.surfaces)
+                self._facts[seen] = facts(shot, anchor, limit=False), paths
+            found, paths = self._facts[seen]
+            now = found | selection_facts(selected_by(prim, time, paths), anchor)
         except IcheatError:
             return None
-        now = self._facts[seen] | selection_facts(selected, anchor)
         if then.get("camera") == AUTO_CAMERA:
             del now["camera-view"]  # It moves with the bounds of the scene.
         elif not camera:
