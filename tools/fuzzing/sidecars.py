@@ -16,6 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from icheat_usd.edits.encodings.sampled import Places, SampledRows
 from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask
 from icheat_usd.errors import IcheatError
 from icheat_usd.sidecar import (
@@ -65,7 +66,39 @@ def payloads() -> list[Payload]:
             made_against={"camera": "/World/Camera", "width": 640, "time": 12.5},
             unknown={"later": Element("later", 3, {"a/b": np.arange(5, dtype=np.uint16)})},
         ),
+        Payload("baked", {}, rows=small_rows()),
     ]
+
+
+def small_rows() -> SampledRows:
+    """Two rows on a tree of four leaves, for three sites."""
+
+    def places(surface: list[int], face: list[int]) -> Places:
+        n = len(surface)
+        uv = np.arange(2 * n, dtype=np.uint16).reshape(n, 2)
+        position = np.arange(3 * n, dtype=np.uint16).reshape(n, 3)
+        return Places(np.array(surface, np.int32), np.zeros(n, np.uint8), np.array(face, np.int32), uv, position)
+
+    return SampledRows(
+        surfaces=(MaskedSurface("/World/Wall", 3, -1, "", "a1"), MaskedSurface("/World/Tree", 2, 5, "leaves")),
+        bounds=np.array([[[0, 0, 0], [1, 2, 3]], [[-1, -1, -1], [1, 1, 1]]], np.float32),
+        leaves=places([0, 0, 1, 1], [0, 1, 0, 1]),
+        leaf_area=np.array([0.5, 1.0, 0.25, 2.0], np.float32),
+        split_size=np.array([2, 1, 1], np.int32),
+        side_surface=np.array([0, 1], np.int32),
+        side=np.zeros(2, np.uint8),
+        side_leaves=np.array([[0, 2], [2, 4]], np.int32),
+        sites=places([0, 1, 1], [2, 0, 1]),
+        site_reach=np.array([0.5, 0.25, 1.0], np.float32),
+        site_row=np.array([0, 1, -1], np.int32),
+        row_pattern=np.array([0, 1], np.int32),
+        row_step=np.full((2, 3), 0.01, np.float32),
+        indptr=np.array([0, 2, 5], np.int64),
+        indices=np.array([0, 2, 0, 1, 3], np.int32),
+        numbers=np.arange(15, dtype=np.int8).reshape(5, 3),
+        kinds=("delta",),
+        epsilon_scale=0.005,
+    )
 
 
 @cache
@@ -157,8 +190,27 @@ def check_payload(payload: Payload) -> None:
             assert all(surface.path.startswith(ANCHOR) for surface in mask.surfaces)
             assert not any(".." in surface.path.split("/") for surface in mask.surfaces)
             assert mask.rest is None or (mask.rest.shape == (n_faces, 2, 2, 3) and np.isfinite(mask.rest).all())
+    if payload.rows is not None:
+        check_rows(payload.rows)
     for rgb in (payload.scale_delta, payload.emission, payload.offset):
         assert rgb is None or (len(rgb) == 3 and np.isfinite(rgb).all())
+
+
+def check_rows(rows: SampledRows) -> None:
+    """Every index of rows that were read stays within what it points to, because kernels follow them."""
+    n_faces = np.array([surface.n_faces for surface in rows.surfaces])
+    for places in (rows.leaves, rows.sites):
+        assert ((places.surface >= 0) & (places.surface < len(rows.surfaces))).all()
+        assert ((places.face >= 0) & (places.face < n_faces[places.surface])).all() if len(places.face) else True
+    assert len(rows.split_size) == rows.n_leaves - 1 and (rows.leaf_area > 0).all()
+    assert (rows.side_leaves >= 0).all() and (rows.side_leaves <= rows.n_leaves).all()
+    assert ((rows.site_row >= -1) & (rows.site_row < len(rows.row_pattern))).all()
+    assert ((rows.row_pattern >= 0) & (rows.row_pattern < len(rows.indptr) - 1)).all()
+    assert rows.indptr[0] == 0 and rows.indptr[-1] == len(rows.indices) == len(rows.numbers)
+    assert (np.diff(rows.indptr) >= 0).all()
+    assert ((rows.indices >= 0) & (rows.indices < rows.n_leaves)).all()
+    assert np.isfinite(rows.row_step).all() and rows.numbers.shape[1] == rows.n_columns == rows.row_step.shape[1]
+    assert len(rows.tree.node_weight) > 0 and rows.samples_digest
 
 
 # Damaged bytes --------------------------------------------------------------------------------------------------------
