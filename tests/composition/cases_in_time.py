@@ -60,6 +60,21 @@ CASES = (
         },
     ),
     Case(
+        "a sequence at another rate of time codes than the shot",
+        {
+            "sequence.usda": layer(
+                stack(keyed(keys({2: "half", 22: "double"}), amount({2: 0.5, 22: 1})), listed=["keyed"]),
+                weaker=["scene.usda"],
+                metadata="timeCodesPerSecond = 48",
+            ),
+            "shot.usda": shot(over("keyed", values(gain={1: 0.5, 11: 1.5}))),
+        },
+        flat=stack(
+            keyed(keys({1: "half", 11: "double"}), amount({1: 0.5, 11: 1}), gain={1: 0.5, 11: 1.5}), listed=["keyed"]
+        ),
+        winners={"keyed.keys": "sequence.usda", "keyed.amount": "sequence.usda", "keyed.gain": "shot.usda"},
+    ),
+    Case(
         "splines ease an amount and a parameter",
         {
             "sequence.usda": layer(

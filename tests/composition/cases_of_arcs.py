@@ -1,4 +1,4 @@
-"""Cases of variants, classes, references, payloads, relocates and instances."""
+"""Cases of classes, references, payloads, relocates and instances."""
 
 from __future__ import annotations
 
@@ -27,32 +27,6 @@ from tests.composition.stages import (
     select,
     stack,
     values,
-)
-
-
-def variants(name: str, **bodies: str) -> str:
-    """A variant set with what each variant says."""
-    each = "\n".join(f'"{variant}" {{\n{body}\n}}' for variant, body in bodies.items())
-    return f'variantSet "{name}" = {{\n{each}\n}}'
-
-
-def selecting(name: str, variant: str, declare: bool = False) -> str:
-    """Metadata that selects a variant."""
-    return f'variants = {{ string {name} = "{variant}" }}' + (f'\nprepend variantSets = "{name}"' if declare else "")
-
-
-GRADED = layer(
-    stack(
-        warm(),
-        variants(
-            "grade",
-            dusk="\n".join([over("warm", values(color=(3, 1, 0.25)), amount({1: 1, 9: 0.5})), dim(), listing("dim")]),
-            day="\n".join([over("warm", values(gain=1.5)), hue(), listing("hue", how="prepend")]),
-        ),
-        listed=["warm"],
-        metadata=selecting("grade", "dusk", declare=True),
-    ),
-    weaker=["scene.usda"],
 )
 
 #: A class above the default prim's edits that they all inherit.
@@ -128,58 +102,6 @@ def zone(name: str, travel: str, softness: float) -> str:
 
 CASES = (
     Case(
-        "the dusk grade of a stack",
-        {"sequence.usda": GRADED, "shot.usda": shot(over("dim", values(gain=0.6)))},
-        flat=stack(dim(gain=0.6), warm(amount({1: 1, 9: 0.5})), listed=["dim", "warm"]),
-        winners={
-            "warm.color": "sequence.usda",  # the opinion beside the variant, which is stronger than the one in it
-            "warm.amount": "sequence.usda",
-            "warm.amount.source": "timeSamples",
-            "dim.gain": "shot.usda",
-            "dim.listed": "sequence.usda",
-        },
-    ),
-    Case(
-        "the day grade of a stack, chosen by the shot",
-        {"sequence.usda": GRADED, "shot.usda": shot(metadata=selecting("grade", "day"))},
-        session=layer(stack(over("hue", values("hsv", hue=90)), over=True)),
-        flat=stack(hue(hue=90), warm(gain=1.5), listed=["hue", "warm"]),
-        winners={"hue.hue": "session.usda", "hue.listed": "sequence.usda", "warm.gain": "sequence.usda"},
-    ),
-    Case(
-        "a grade that the shot adds and the session chooses",
-        {
-            "sequence.usda": GRADED,
-            "shot.usda": shot(
-                variants("grade", night="\n".join([over("warm", values(gain=0.25)), hue(), listing("hue")]))
-            ),
-        },
-        session=layer(stack(over=True, metadata=selecting("grade", "night"))),
-        flat=stack(hue(), warm(gain=0.25), listed=["hue", "warm"]),
-        winners={"hue.listed": "shot.usda", "warm.gain": "shot.usda", "warm.listed": "sequence.usda"},
-    ),
-    Case(
-        "a variant of one edit",
-        {
-            "sequence.usda": layer(
-                stack(
-                    edit(
-                        "warm",
-                        variants("look", soft=amount(0.25), hard=values(color=(4, 2, 1)) + "\n" + keys("half")),
-                        receivers=[ROOM],
-                        casters=[BLOCK],
-                        metadata=selecting("look", "soft", declare=True),
-                    ),
-                    listed=["warm"],
-                ),
-                weaker=["scene.usda"],
-            ),
-            "shot.usda": shot(over("warm", metadata=selecting("look", "hard"))),
-        },
-        flat=stack(warm(keys("half"), color=(4, 2, 1)), listed=["warm"]),
-        winners={"warm.color": "sequence.usda", "warm.keys": "sequence.usda", "warm.amount": ""},
-    ),
-    Case(
         "edits inherit a class that the shot overrides for all of them",
         {
             "sequence.usda": layer(
@@ -201,6 +123,34 @@ CASES = (
         ),
         winners={"warm.color": "shot.usda", "warm.amount": "session.usda", "other.amount": "sequence.usda"},
         retimings=("sublayer",),  # Below a reference the session's class would be stronger than what an edit says.
+    ),
+    Case(
+        "a stack inherits its edits from a class that the shot adds to",
+        {
+            "sequence.usda": layer(
+                'class Scope "_grade" (\nprepend apiSchemas = ["IcheatStackAPI"]\n)\n{\n'
+                + "append rel icheat:edits = [</World/_grade/warm>, </World/_grade/dim>]\n"
+                + warm(amount({1: 0, 9: 1}))
+                + "\n"
+                + dim()
+                + '\n}\ndef Scope "Edits" (\nprepend inherits = </World/_grade>\n)\n{\n}',
+                weaker=["scene.usda"],
+            ),
+            "shot.usda": layer(
+                over("_grade", "append rel icheat:edits = </World/_grade/hue>", hue())
+                + "\n"
+                + stack(over("warm", values(gain=0.5)), listing("dim", how="delete"), over=True),
+                weaker=["sequence.usda"],
+            ),
+        },
+        flat=stack(warm(amount({1: 0, 9: 1}), gain=0.5), hue(), listed=["warm", "hue"]),
+        winners={
+            "warm.gain": "shot.usda",
+            "warm.amount": "sequence.usda",
+            "warm.listed": "sequence.usda",
+            "hue.listed": "shot.usda",
+        },
+        removed={"dim": "shot.usda"},
     ),
     Case(
         "an edit specializes another and keeps what it says itself",

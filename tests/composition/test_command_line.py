@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from icheat_usd.cli import main
-from tests.composition.cases_of_arcs import GRADED, GREY, ROSY, borrowed, library, selecting
+from tests.composition.cases_of_arcs import GREY, ROSY, borrowed, library
 from tests.composition.cases_of_layers import BLOCK, PILLAR, ROOM, dim, hue, shot, warm
+from tests.composition.cases_of_variants import GRADED, selecting
 from tests.composition.stages import SCENE, STACK, amount, edit, layer, listing, over, select, stack, values
 
 

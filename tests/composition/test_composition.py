@@ -15,11 +15,12 @@ from typing import Any
 import pytest
 
 from icheat_usd.errors import SidecarError
-from tests.composition import cases_in_time, cases_of_arcs, cases_of_layers
+from tests.composition import cases_in_time, cases_of_arcs, cases_of_layers, cases_of_variants
 from tests.composition.reading import open_case, read_case
 from tests.composition.stages import Case, retimed, write_case, write_flat
 
-CASES = {case.name: case for case in (*cases_of_layers.CASES, *cases_of_arcs.CASES, *cases_in_time.CASES)}
+THEMES = (cases_of_layers, cases_of_variants, cases_of_arcs, cases_in_time)
+CASES = {case.name: case for module in THEMES for case in module.CASES}
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,9 @@ from icheat_usd.stage.description import describe_edit
 from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.stage.key_authoring import set_payload_key
 from icheat_usd.stage.keys import read_keys
-from tests.composition.cases_of_arcs import GRADED, LOOK, selecting, variants
+from tests.composition.cases_of_arcs import LOOK
 from tests.composition.cases_of_layers import SEQUENCE, keyed, shot
+from tests.composition.cases_of_variants import GRADED, selecting, variants
 from tests.composition.stages import DIGESTS, SCENE, SIDECAR, STACK, SURFACES, keys, layer, stack
 
 ORDER = ("warm", "dim", "hue")
