@@ -129,5 +129,5 @@ def build_relighter(
     counts = samples_per_light(snapshot, light_samples, dome_samples)
     direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, counts)
     progress("light the view samples", 1.0)
-    held_back = HeldBack(snapshot, tracer, view, gather, transport)
+    held_back = HeldBack(snapshot, tracer, view, gather, transport, progress)
     return Relighter(view, gather, transport, direct, cell_light, held_back)

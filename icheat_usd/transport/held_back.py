@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from icheat_usd.materials import is_glossy, take_points
-from icheat_usd.progress import silent
+from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer, first_surfaces
@@ -16,7 +16,7 @@ from icheat_usd.transport.rays import RowBuilder, scatter_rows
 from icheat_usd.transport.sparse import SparseRows
 
 #: Sets of rows that are kept: one for each edit that an artist goes back and forth between.
-_KEPT = 4
+_KEPT = 8
 
 
 class HeldBack:
@@ -29,10 +29,16 @@ class HeldBack:
     """
 
     def __init__(
-        self, snapshot: SceneSnapshot, tracer: Tracer, view: ViewSamples, gather: GatherSamples, transport: Transport
+        self,
+        snapshot: SceneSnapshot,
+        tracer: Tracer,
+        view: ViewSamples,
+        gather: GatherSamples,
+        transport: Transport,
+        progress: Progress = silent,
     ) -> None:
         self._snapshot, self._tracer, self._view, self._gather = snapshot, tracer, view, gather
-        self._transport = transport
+        self._transport, self._progress = transport, progress
         self._kept: dict[tuple[bytes, bytes], tuple[Lobe, ...]] = {}
 
     def rows(self, samples: I64, occluders: Bool) -> tuple[Lobe, ...]:
@@ -53,12 +59,12 @@ class HeldBack:
     def _trace(self, samples: I64, occluders: Bool) -> tuple[Lobe, ...]:
         transport, view = self._transport, self._view
         which = samples
+        n_rows = len(transport.row_view)
         if transport.interpolation is not None:
             spread = transport.interpolation
             used = np.zeros(view.n, np.bool_)
             used[samples] = True
             which = np.unique(spread.indices[np.repeat(used, np.diff(spread.indptr))]).astype(np.int64)
-        n_rows = len(transport.row_view)
         if len(which) == 0:
             return ()
         row_view = transport.row_view[which].astype(np.int64)
@@ -68,10 +74,10 @@ class HeldBack:
             builder = _BehindOccluders(self._snapshot, self._tracer, clear, self._gather, transport.seed, occluders)
             one_each = np.arange(len(which) + 1, dtype=np.int64)
             rays = transport.rays_per_row
-            found = [builder.diffuse_rows(points, one_each, row_view, rays, 0, silent, "")]
+            found = [builder.diffuse_rows(points, one_each, row_view, rays, 0, self._progress, "rays behind occluders")]
             glossy = np.flatnonzero(is_glossy(points))
             if len(glossy):
-                found += builder.specular_rows(points, view.to_eye[row_view], row_view, glossy, rays, silent)
+                found += builder.specular_rows(points, view.to_eye[row_view], row_view, glossy, rays, self._progress)
         finally:
             clear.close()
         return tuple(
