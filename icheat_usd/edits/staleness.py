@@ -154,10 +154,11 @@ def changes(then: Mapping[str, str | float | int], now: Mapping[str, str | float
     now
         `facts` with ``limit=False``.
     """
-    motion = _common_motion(then, now)
-    found = [*_camera_changes(then, now, motion), *_surface_changes(then, now, motion)]
-    found += [*_light_changes(then, now, motion), *_selection_changes(then, now)]
-    return tuple(found)
+    with np.errstate(all="ignore"):  # Anyone may have written `then`, with numbers that overflow.
+        motion = _common_motion(then, now)
+        found = [*_camera_changes(then, now, motion), *_surface_changes(then, now, motion)]
+        found += [*_light_changes(then, now, motion), *_selection_changes(then, now)]
+        return tuple(found)
 
 
 # --------------------------------------------------------------------------- each aspect
@@ -349,7 +350,8 @@ def _common_motion(then: Mapping[str, Any], now: Mapping[str, Any]) -> F64:
     were, are = tables
     pairs = [(were[path].place, _about(are[path].place, then, now)) for path in were if path in are and path != OTHERS]
     for was, is_ in pairs:
-        if abs(np.linalg.det(was[:, :3])) > 1e-12:
+        size = float(np.abs(was[:, :3]).max())
+        if size > 0 and np.linalg.cond(was[:, :3] / size) < 1e6:
             linear = is_[:, :3] @ np.linalg.inv(was[:, :3])
             motion = np.concatenate([linear, (is_[:, 3] - linear @ was[:, 3])[:, None]], axis=1)
             break

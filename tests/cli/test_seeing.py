@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Usd
 
 from icheat_usd.cli import main
 from icheat_usd.image.exr import read_exr
@@ -97,6 +97,30 @@ def test_tree_says_what_became_stale(shot: Path, capsys: pytest.CaptureFixture[s
     assert "STALE" in text and "stale: gain is 2, and was 3 when it was baked" in text
     findings = as_json(capsys, "check", shot, status=1)["findings"]
     assert [finding["rule"] for finding in findings] == ["BakedParametersChanged"]
+
+
+def test_rows_that_are_really_baked_become_stale_with_the_light(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--width", "24", "--height", "18", "--gather", "256", "--epsilon", "0.1"]
+    assert main(["bake", str(shot), "warm", "grey", *small]) < 2  # a finding: rows of hsv hold for this light
+    assert as_json(capsys, "check", shot)["findings"] == []
+    edits = as_json(capsys, "tree", shot)["edits"]
+    assert all("rows" in edit["payloads"][0]["elements"] and not edit["stale"] for edit in edits)
+
+    room = Usd.Stage.Open(str(shot.with_name("room.usda")))
+    room.GetPrimAtPath("/World/Lamp").GetAttribute("inputs:intensity").Set(30.0)
+    room.GetRootLayer().Save()
+    warm, grey = as_json(capsys, "tree", shot)["edits"]
+    assert not warm["stale"] and grey["payloads"][0]["stale"] == ["light Lamp got brighter (1.5 times)"]
+    assert as_json(capsys, "tree", shot, "--quick")["edits"][1]["stale"] is False
+    (finding,) = as_json(capsys, "check", shot, status=1)["findings"]
+    assert finding["rule"] == "BakedStale" and finding["prim"] == "/World/Edits/grey"
+    assert main(["bake", str(shot), "grey", *small]) < 2
+    assert as_json(capsys, "check", shot)["findings"] == []
+
+    room.GetPrimAtPath("/World/Block").GetAttribute("xformOp:translate").Set((0.5, -1.5, 0.5))
+    room.GetRootLayer().Save()
+    stale = [edit["payloads"][0]["stale"] for edit in as_json(capsys, "tree", shot)["edits"]]
+    assert stale == [["surface Block moved"]] * 2
 
 
 def test_tree_shows_a_payload_that_is_lost(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -213,3 +213,17 @@ def test_facts_hold_only_numbers_and_text_and_are_quick() -> None:
     assert time.perf_counter() - began < 0.5  # 0.02 s on an idle machine
     assert all(isinstance(value, (str, int, float)) for value in found.values())
     assert sum(len(str(value)) for value in found.values()) < 20_000
+
+
+def test_mutated_facts_never_stop_anything() -> None:
+    random = np.random.default_rng(5)
+    then, now = facts(room(extra=3), "/World"), facts(room(lamp=7.0), "/World", limit=False)
+    letters = "0123456789abcdefe+-. \t\n*nai"
+    for _ in range(400):
+        broken = dict(then)
+        name = str(random.choice(sorted(broken)))
+        text = list(str(broken[name]))
+        for place in random.integers(0, len(text), 1 + int(random.integers(3))):
+            text[place] = str(random.choice(list(letters)))
+        broken[name] = "".join(text)
+        assert all(isinstance(change.text, str) for change in changes(broken, now))
