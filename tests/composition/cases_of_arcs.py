@@ -267,6 +267,7 @@ CASES = (
         },
         flat=stack(edit("rosy", ROSY, receivers=[PILLAR], casters=[BLOCK]), listed=["rosy"]),
         winners={"rosy.color": "edits.usda"},
+        findings=("TargetDropped",),
     ),
     Case(
         "limits, lights and a target of a library follow the reference, the layers' times and the shot",

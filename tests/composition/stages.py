@@ -188,6 +188,7 @@ class Case:
     time: float = 4.0
     scene: str = SCENE
     surfaces: tuple[str, ...] = SURFACES
+    findings: tuple[str, ...] = ()  #: rules of `check` that it breaks
     retimings: tuple[str, ...] = ("sublayer", "reference")  #: ways to bring the shot under a layer offset
 
 

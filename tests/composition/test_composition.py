@@ -79,6 +79,12 @@ def test_the_layer_of_each_value_is_told(case: Case, written: dict[str, Any]) ->
     assert told["removed"] == case.removed
 
 
+def test_check_finds_what_is_wrong_and_nothing_else(case: Case, written: dict[str, Any]) -> None:
+    composed = written[case.name][0]
+    for opened in (composed, *(retimed(composed, how) for how in case.retimings)):
+        assert {rule for rule, _, _ in read_case(opened)["checked"]} == set(case.findings)
+
+
 def test_a_host_that_composed_first_reads_the_same(written: dict[str, Any]) -> None:
     opened = [
         each
