@@ -145,13 +145,13 @@ def _normals(places: NDArray[np.floating]) -> F64:
 def _nearest(places: F64, normals: F64, queries: F64, query_normals: F64) -> I64:
     low, high = places.min(axis=0), places.max(axis=0)
     extent = float((high - low).max())
-    # As many cells as places, were these spread all over: on a surface some dozen share a cell.
-    size = max(extent / max(np.cbrt(len(places)), 1.0), 1e-30)
+    spacing = max(extent / np.sqrt(len(places)), 1e-30)
+    # A few cells for each place: most hold none, as places lie on a surface, and the others about a dozen.
+    size = max(float(np.cbrt(np.maximum(high - low, spacing).prod() / (4 * len(places)))), spacing)
     dims = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
     begin = np.zeros(int(dims.prod()) + 1, np.int64)
     cell, order = np.empty(len(places), np.int64), np.empty(len(places), np.int64)
     kernels.sort_into_cells(places, low, size, dims, cell, begin, order)
-    spacing = extent / np.sqrt(len(places))
     found = np.empty(len(queries), np.int64)
     kernels.nearest_place(
         places, normals, low, size, dims, begin, order, (_DETOUR * spacing) ** 2, queries, query_normals, found

@@ -41,15 +41,19 @@ def nearest_place(position, normal, low, size, dims, begin, order, weight, query
         inside = np.empty(3)
         centre = np.empty(3, np.int64)
         outside = 0.0
+        border = np.inf
         for c in range(3):
             inside[c] = min(max(query[q, c], low[c]), low[c] + size * dims[c])
             outside += (query[q, c] - inside[c]) ** 2
             centre[c] = _cell(inside[c], low[c], size, dims[c])
+            within = inside[c] - low[c] - size * centre[c]
+            border = max(min(border, min(within, size - within)), 0.0)
         best = np.int64(-1)
         best_distance = np.inf
         for ring in range(max(dims[0], max(dims[1], dims[2]))):
-            # Rings before this one hold everything nearer than so many cells.
-            if best >= 0 and outside + (max(ring - 1, 0) * size) ** 2 > best_distance:
+            # Rings before this one hold everything nearer than this.
+            reach = border + (ring - 1) * size if ring > 0 else 0.0
+            if best >= 0 and outside + reach * reach > best_distance:
                 break
             for iz in range(max(centre[2] - ring, 0), min(centre[2] + ring + 1, dims[2])):
                 for iy in range(max(centre[1] - ring, 0), min(centre[1] + ring + 1, dims[1])):
