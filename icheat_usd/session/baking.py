@@ -206,7 +206,7 @@ def flatten_stack(
     sessions = _Sessions(stage, shot, progress)
     first = sessions.at(frames[0] if frames else None)
     stack_path, stack = first.stack_path, first.stack
-    parts = [edit.path for edit in _pair_edits(stack).active]
+    parts = [edit.path for edit in _pair_edits(stack).edits if edit.enabled] if stack.enabled else []
     if stack_path is None or not parts:
         raise EditError(f"{stack_path or 'the stage'} has no active edit to flatten; name another stack with --stack")
     times: Sequence[float | None] = sorted(set(frames)) if frames else [None]
@@ -222,19 +222,23 @@ def flatten_stack(
         weight = (middle - low) / (high - low)
         session, field = _stack_at(sessions, middle)
         work = PairSamples(field, session.view, session.gather, *_light(session, field))
-        keys = [(baked[low].rows, 1 - weight), (baked[high].rows, weight)]
-        if largest_error(work, keys, session.snapshot) > max(epsilon, baked[low].measured, baked[high].measured):
+        ends = [(found, share) for found, share in ((baked[low], 1 - weight), (baked[high], weight)) if found]
+        keys = [(found.rows, share) for found, share in ends]
+        allowed = max([epsilon, *(found.measured for found, _ in ends)])
+        if largest_error(work, keys, session.snapshot) > allowed:
             baked[middle] = _bake_stack(sessions, middle, stack_path, epsilon, coefficients)
             pending += [(low, middle), (middle, high)]
     anchor = _anchor(stage)
-    made = [
-        _Key(
-            time,
-            Payload(BAKED, {}, rows=baked[time].rows, made_against=facts(sessions.at(time).snapshot, anchor)),
-            baked[time],
-        )
-        for time in sorted(baked, key=lambda t: (t is not None, t or 0.0))
-    ]
+    if not any(baked.values()):
+        raise EditError(f"{stack_path}: none of its edits does anything at these frames; choose others with --frames")
+    made = []
+    identity = []
+    for time, found in sorted(baked.items(), key=lambda item: (item[0] is not None, item[0] or 0.0)):
+        if found is None:
+            identity.append(time)
+            continue
+        facts_then = facts(sessions.at(time).snapshot, anchor)
+        made.append(_Key(time, Payload(BAKED, {}, rows=found.rows, made_against=facts_then), found))
     file: Path | None = None
     findings: list[Finding] = []
     try:
@@ -256,6 +260,8 @@ def flatten_stack(
                 findings += key_authoring.set_payload_key(
                     stage, path, layer=target, time=key.time, payload=(file, digest)
                 )
+            for time in identity:
+                findings += key_authoring.set_payload_key(stage, path, layer=target, time=time, payload=None)
             for part in parts:
                 findings += authoring.set_edit(stage, part, layer=target, enabled=False)
         _save(target)
@@ -351,8 +357,11 @@ def _stack_at(sessions: _Sessions, time: float | None) -> tuple[Session, EditFie
 
 def _bake_stack(
     sessions: _Sessions, time: float | None, where: str, epsilon: float, coefficients: int | None
-) -> BakedRows:
+) -> BakedRows | None:
+    """Rows of a stack, None where none of its edits does anything at that time."""
     session, field = _stack_at(sessions, time)
+    if field.is_identity:
+        return None
     return _bake(session, field, where, epsilon, coefficients)
 
 

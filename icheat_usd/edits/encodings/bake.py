@@ -137,20 +137,26 @@ def bake_field(
 
 
 def largest_error(work: PairSamples, keys: Sequence[tuple[SampledRows, float]], snapshot: SceneSnapshot) -> float:
-    """Largest difference of S between a field and rows, at random pairs that the field touches.
+    """Largest difference of S between a field and rows, at random pairs that either touches.
 
     Parameters
     ----------
     keys : sequence of (SampledRows, float)
-        Rows and their weights, which sum to 1: those of two keys are interpolated as in an edit.
+        Rows and their weights: those of two keys are interpolated as in an edit. A key that is missing is the identity.
     """
     rng = np.random.default_rng(2)
-    touched = np.flatnonzero(work.touched)
-    samples = touched[np.sort(rng.permutation(len(touched))[:_MEASURED_SAMPLES])]
-    leaves = np.sort(rng.permutation(work.n_leaves)[:_MEASURED_LEAVES])
-    at_view = take_points(work.view.points, samples)
-    at_gather = take_points(work.gather.points, work.leaf_numbers[leaves])
     bound = [(bind_rows(rows, snapshot, ""), np.float32(weight)) for rows, weight in keys]
+    touched, sending = work.touched.copy(), work.leaves.copy()
+    for key, _ in bound:
+        touched |= key.locate_receivers(work.view.points).confidence > 0
+        sending |= key.locate_casters(work.gather.points) >= 0
+    samples, leaves = (
+        np.sort(rng.permutation(np.flatnonzero(which))[:n])
+        for which, n in ((touched, _MEASURED_SAMPLES), (sending, _MEASURED_LEAVES))
+    )
+    if not len(samples) or not len(leaves):
+        return 0.0
+    at_view, at_gather = take_points(work.view.points, samples), take_points(work.gather.points, leaves)
     located = [(key.locate_receivers(at_view), key.locate_casters(at_gather)) for key, _ in bound]
     total = sum(weight * mixture.confidence for (_, weight), (mixture, _) in zip(bound, located, strict=True))
     largest, step = 0.0, max(1, PAIRS_AT_ONCE // len(leaves))
@@ -163,6 +169,6 @@ def largest_error(work: PairSamples, keys: Sequence[tuple[SampledRows, float]], 
             wide = Mixture._make(np.repeat(column[some], len(leaves), axis=0) for column in mixture)
             share = np.repeat(np.broadcast_to(share, len(samples))[some], len(leaves))
             decoded += share[:, None] * (key.evaluate(wide, np.tile(leaf, len(some))).scale - np.float32(1))
-        exact = work.pairs(samples[some], leaves)[:, :, :3].reshape(-1, 3)
+        exact = work.pairs_of(samples[some], leaves)[:, :, :3].reshape(-1, 3)
         largest = max(largest, float(np.abs(decoded - exact).max()))
     return largest

@@ -36,12 +36,11 @@ class PairSamples:
         casters = field.casters(gather.points)
         self.leaves = _whole_slots(gather, np.asarray(np.any(casters.masks > 0, axis=0), np.bool_))
         self.leaf_numbers = np.flatnonzero(self.leaves)
-        self.casters = casters.take(self.leaf_numbers)
         self.receivers = field.receivers(view.points)
         self.touched: Bool = np.asarray(np.any(self.receivers.masks > 0, axis=0), np.bool_)
         b = np.ones((gather.n, 3), np.float32) if radiance is None else radiance
         self.resolved, self.lost = _resolve(field, self.receivers, casters, b, transport)
-        self.b = np.ascontiguousarray(b[self.leaf_numbers])
+        self._casters, self._radiance = casters, b
         self.kinds = KINDS if field.has_offset else KINDS[:2]
         self.varies = field.uses_receiver or bool(self.resolved) or field.has_offset
         self.is_product = not self.varies and field.n_rows == 1
@@ -60,10 +59,14 @@ class PairSamples:
 
     def pairs(self, samples: I64, leaves: I64) -> F32:
         """Values of all pairs, (n_samples, n_leaves, k)."""
-        n, m = len(samples), len(leaves)
+        return self.pairs_of(samples, self.leaf_numbers[leaves])
+
+    def pairs_of(self, samples: I64, gather: I64) -> F32:
+        """The same for any gather samples."""
+        n, m = len(samples), len(gather)
         receivers = self.receivers.take(np.repeat(samples, m))
-        casters = self.casters.take(np.tile(leaves, n))
-        b = np.tile(self.b[leaves], (n, 1))[None]
+        casters = self._casters.take(np.tile(gather, n))
+        b = np.tile(self._radiance[gather], (n, 1))[None]
         resolved = [np.repeat(scale[samples], m, axis=0) for scale in self.resolved]
         found = self.field.evaluate(b, receivers, casters, resolved)
         parts = [found.scale[0] - np.float32(1), found.emission]
@@ -80,7 +83,7 @@ class PairSamples:
         """The row of a receiver with mask 1, (1, n_leaves, k), where rows are products of masks and this."""
         one = self.receivers.take(np.flatnonzero(self.touched)[:1])
         one = one._replace(masks=np.ones_like(one.masks))
-        found = self.field.evaluate(self.b[None], one, self.casters)
+        found = self.field.evaluate(self._radiance[self.leaf_numbers][None], one, self._casters.take(self.leaf_numbers))
         return np.concatenate([found.scale[0] - np.float32(1), found.emission], axis=1)[None]
 
     def _like(self, samples: I64) -> tuple[I64, I64]:
