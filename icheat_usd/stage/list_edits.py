@@ -81,7 +81,8 @@ def dropped_targets(prim: Usd.Prim, name: str) -> list[tuple[Sdf.Path, str]]:
 def _opinions(prim: Usd.Prim, name: str) -> Iterator[_Opinion]:
     """Every opinion on a relationship, strongest first, through all arcs."""
     queried = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
-    for arc in Usd.PrimCompositionQuery(queried).GetCompositionArcs():
+    arcs = Usd.PrimCompositionQuery(queried).GetCompositionArcs()
+    for arc in arcs:  # Its node lives only as long as the arcs do.
         node = arc.GetTargetNode()
 
         def on_stage(path: Sdf.Path, node: Any = node) -> str:

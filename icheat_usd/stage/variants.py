@@ -95,13 +95,26 @@ def variant_target(stage: Usd.Stage, layer: Sdf.Layer, place: Sdf.Path) -> Usd.E
     spec = layer.GetPrimAtPath(owner)
     names = spec.GetInfo("variantSetNames") if spec and spec.HasInfo("variantSetNames") else None
     Sdf.JustCreatePrimInLayer(layer, place)
-    # The composed prim has the set already; naming it here again would change the strength of the prim's other sets.
+    # Layers here name the set already, as a rule; naming it again would change the strength of the prim's other sets.
+    spec = layer.GetPrimAtPath(owner)
     if names is None:
-        layer.GetPrimAtPath(owner).ClearInfo("variantSetNames")
+        spec.ClearInfo("variantSetNames")
     else:
-        layer.GetPrimAtPath(owner).SetInfo("variantSetNames", names)
-    for arc in Usd.PrimCompositionQuery(stage.GetPrimAtPath(owner)).GetCompositionArcs():
+        spec.SetInfo("variantSetNames", names)
+    target = _composed_target(stage, layer, place)
+    if target is None:  # Only what is referenced names it.
+        spec.variantSetNameList.appendedItems.append(place.GetVariantSelection()[0])
+        target = _composed_target(stage, layer, place)
+    if target is None:
+        raise EditError(f"{place} does not compose from {layer.identifier}; author it without a variant")
+    return target
+
+
+def _composed_target(stage: Usd.Stage, layer: Sdf.Layer, place: Sdf.Path) -> Usd.EditTarget | None:
+    """The variant's opinions of a layer as they compose, None where they do not."""
+    arcs = Usd.PrimCompositionQuery(stage.GetPrimAtPath(place.GetPrimPath())).GetCompositionArcs()
+    for arc in arcs:  # Its node lives only as long as the arcs do.
         node = arc.GetTargetNode()
         if node.path == place and layer in node.layerStack.layers:
             return Usd.EditTarget(layer, node)
-    raise EditError(f"{place} does not compose from {layer.identifier}; author it without a variant")
+    return None

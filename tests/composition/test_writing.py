@@ -18,10 +18,23 @@ from icheat_usd.stage.description import describe_edit
 from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.stage.key_authoring import set_payload_key
 from icheat_usd.stage.keys import read_keys
-from tests.composition.cases_of_arcs import LOOK
+from tests.composition.cases_of_arcs import LOOK, ROSY, library
 from tests.composition.cases_of_layers import SEQUENCE, keyed, shot
 from tests.composition.cases_of_variants import GRADED, selecting, variants
-from tests.composition.stages import DIGESTS, SCENE, SIDECAR, STACK, SURFACES, keys, layer, stack
+from tests.composition.stages import (
+    DIGESTS,
+    SCENE,
+    SIDECAR,
+    STACK,
+    SURFACES,
+    amount,
+    edit,
+    keys,
+    layer,
+    over,
+    stack,
+    values,
+)
 
 ORDER = ("warm", "dim", "hue")
 
@@ -218,6 +231,25 @@ def test_a_variant_of_an_edit_is_found_before_that_of_its_stack(tmp_path: Path) 
     stage = write(tmp_path, layer(stack(edit, listed=["keyed"]), weaker=["scene.usda"]), shot())
     set_edit(stage, f"{STACK}/keyed", layer="shot.usda", amount=0.5, variant=("look", "hard"))
     assert stage.GetRootLayer().GetAttributeAtPath(f"{STACK}/keyed{{look=hard}}.icheat:amount").default == 0.5
+
+
+def test_a_shot_writes_into_a_grade_of_a_library_it_references(tmp_path: Path) -> None:
+    (tmp_path / "library").mkdir()
+    grades = variants("grade", dusk=over("rosy", amount(0.5)), day=over("rosy", values(gain=3)))
+    schemas = 'prepend apiSchemas = ["IcheatStackAPI"]\n' + selecting("grade", "dusk", declare=True)
+    body = "append rel icheat:edits = </Library/rosy>\n" + grades
+    (tmp_path / "library" / "edits.usda").write_text(library(edit("rosy", ROSY), body=body, metadata=schemas))
+    sequence = 'def "Edits" (\nprepend references = @./library/edits.usda@\n)\n{\n}'
+    stage = write(tmp_path, layer(sequence, weaker=["scene.usda"]), shot(), "(offset = 10; scale = 2)")
+    for where, value in (("sequence.usda", 0.25), ("shot.usda", 0.75)):
+        before = texts(stage)
+        assert not set_edit(stage, f"{STACK}/rosy", layer=where, amount=value, time=30, variant=("grade", "day"))
+        assert changed(stage, before) == [where]
+    assert describe_edit(stage, f"{STACK}/rosy").amount.value == 0.5
+    select(stage, "day")
+    told = describe_edit(stage, f"{STACK}/rosy", 30)
+    assert (told.amount.value, Path(told.amount.layer).name) == (0.75, "shot.usda")
+    assert told.parameters["gain"].value == 3
 
 
 @pytest.mark.parametrize(
