@@ -166,7 +166,7 @@ class InstancerReader:
                 self._report(light, "instanced light", "a light inside a point-instanced prototype is left out.")
         gprims = [prim for prim in found.gprims if self._is_shown_within(prim, root)]
         parts = [
-            _Part(mesh, relative_matrix(builder.xforms, prim, root) @ to_prototype, _relative_path(prim, root))
+            _Part(mesh, builder.matrix_below(prim, root) @ to_prototype, _relative_path(prim, root))
             for prim, mesh in zip(gprims, builder.add_meshes(gprims), strict=True)
             if mesh is not None
         ]

@@ -161,9 +161,20 @@ class GeometryBuilder:
         self.place(np.array([mesh for _, mesh in placed]), matrices, names)
 
     def _local_to_world(self, prim: Usd.Prim) -> Gf.Matrix4d:
-        deformation = None if prim.IsA(UsdGeom.Mesh) else self.skinning.deformation(prim)
-        moved = None if deformation is None else deformation.placement()
+        moved = self._moved_by_joints(prim)
         return self.xforms.GetLocalToWorldTransform(prim) if moved is None else moved
+
+    def matrix_below(self, prim: Usd.Prim, root: Usd.Prim) -> F64:
+        """Row-vector matrix (4, 4) from a gprim's space to that of `root`, whose own transform is left out."""
+        moved = self._moved_by_joints(prim)
+        if moved is None:
+            return relative_matrix(self.xforms, prim, root)
+        return np.array(moved * self.xforms.GetLocalToWorldTransform(root).GetInverse())
+
+    def _moved_by_joints(self, prim: Usd.Prim) -> Gf.Matrix4d | None:
+        """Local-to-world matrix of a gprim without points that is bound to a skeleton, None for any other."""
+        deformation = None if prim.IsA(UsdGeom.Mesh) else self.skinning.deformation(prim)
+        return None if deformation is None else deformation.placement()
 
     def place(self, meshes: I64, matrices: F64, names: Sequence[tuple[str, int, str]]) -> None:
         """Add one surface per row.

@@ -286,6 +286,32 @@ def test_a_sphere_bound_rigidly_goes_where_its_joint_goes() -> None:
         np.testing.assert_allclose(middle, expected, atol=2e-3)
 
 
+def test_point_instances_of_a_figure_are_skinned_with_all_their_parts() -> None:
+    alone = leg()
+    stage = leg("/Crowd/Figure")
+    crowd = UsdGeom.PointInstancer.Define(stage, "/World/Crowd")
+    crowd.CreatePrototypesRel().SetTargets(["/World/Crowd/Figure"])
+    crowd.CreateProtoIndicesAttr([0])
+    crowd.CreatePositionsAttr([(0, 0, 0)])
+    for target, root in ((alone, "/World/Leg"), (stage, "/World/Crowd/Figure")):
+        ball = UsdGeom.Sphere.Define(target, f"{root}/Ball")
+        binding = UsdSkel.BindingAPI.Apply(ball.GetPrim())
+        binding.CreateSkeletonRel().SetTargets([f"{root}/Skeleton"])
+        binding.CreateJointIndicesPrimvar(True, 1).Set([2])
+        binding.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    one, many = (take_snapshot(target, camera="auto", time=20) for target in (alone, stage))
+    assert sorted(surface.part for surface in many.surfaces) == ["Ball", "Mesh"]
+    boxes = []
+    for snapshot in (one, many):
+        g = snapshot.geometry
+        corners = [
+            g.points[g.mesh_begin[m] : g.mesh_begin[m + 1]].reshape(-1, 3) @ w[:, :3].T + w[:, 3] + snapshot.centre
+            for m, w in zip(g.instance_mesh, g.instance_to_world, strict=True)
+        ]
+        boxes.append(sorted(np.concatenate([c.min(axis=0), c.max(axis=0)]).tolist() for c in corners))
+    np.testing.assert_allclose(boxes[0], boxes[1], atol=1e-5)
+
+
 def test_instances_of_one_skeleton_take_their_own_animation() -> None:
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
