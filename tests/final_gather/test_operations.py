@@ -8,7 +8,8 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.edits.model import Edit
+from icheat_usd.edits.encodings.bake import bake_field
+from icheat_usd.edits.model import Edit, KeyedPayload, Payload
 from icheat_usd.relight import Relighter
 from icheat_usd.scene import LightKind, SceneSnapshot
 from icheat_usd.tracing import build_tracer
@@ -73,6 +74,14 @@ def test_differences_in_the_light_of_one_lamp_are_those_of_the_relighter():
     warm = edit("scale", everything, everything, lights=("/warm",))
     turn = edit("hsv", select("/floor", "/back"), everything, lights=("/cold",))
     assert_both_renderers_agree(shiny_previews(), (warm, turn))
+
+
+def test_differences_that_baked_rows_make_are_those_of_the_relighter():
+    parts = previews()[0]
+    field = parts.field(edit("falloff", select("/floor", "/back"), select("/red", "/green", "/ceiling")))
+    rows = bake_field(field, parts.view, parts.gather, parts.snapshot, where="/falloff").rows
+    keys = (KeyedPayload(Payload("baked", {}, rows=rows), 1.0),)
+    assert_both_renderers_agree(previews(), (Edit("/baked", "baked", {}, EVERYTHING, EVERYTHING, keys=keys),))
 
 
 # Identity -------------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.edits import operations, reference
+from icheat_usd.edits.encodings.bake import bake_field
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend, Edit, KeyedPayload, MaskedSurface, Payload, SurfaceMask
 from icheat_usd.relight import receivers as grouping
@@ -182,3 +183,20 @@ def test_levels_that_meet_equal_the_slow_evaluator(name, monkeypatch):
         for k, operation in enumerate(MIXED[name])
     )
     assert_equals_the_slow_evaluator("full", edits, monkeypatch)
+
+
+def baked(operation: str, casters: Any) -> Payload:
+    of = pipeline("full")
+    field = of.field(edit("op", operation, select("/floor", "/back"), casters))
+    return Payload("baked", {}, rows=bake_field(field, of.view, of.gather, of.snapshot, where="/op").rows)
+
+
+@pytest.mark.parametrize("n_keys", [1, 2])
+def test_baked_rows_equal_the_slow_evaluator(n_keys, monkeypatch):
+    """Rows are looked up at both ends of each pair; of two keys, each has its own."""
+    payloads = [baked("falloff", select("/red", "/ceiling")), baked("direction", select("/red", "/green"))]
+    keys = tuple(KeyedPayload(payload, 1.0 / n_keys) for payload in payloads[:n_keys])
+    rows = Edit("/op", "baked", {}, SOME, EVERYTHING, amount=0.8, keys=keys)
+    warm = edit("warm", "scale", select("/floor"), select("/red", "/back"))
+    curve = edit("curve", "gamma", select("/floor"))
+    assert_equals_the_slow_evaluator("full", (warm, rows, curve), monkeypatch)
