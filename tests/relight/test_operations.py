@@ -151,7 +151,8 @@ def assert_equals_the_slow_evaluator(kind: str, edits: tuple[Edit, ...], monkeyp
 
 
 def test_every_operation_is_here():
-    assert set(operations.names()) <= set(PARAMETERS)
+    own = {n for n in operations.names() if type(operations.find(n)).__module__.startswith("icheat_usd.")}
+    assert own == set(PARAMETERS)
 
 
 @pytest.mark.parametrize("stack", stacks("scale"))
