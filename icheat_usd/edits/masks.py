@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.edits.model import MaskedSurface, SurfaceMask
-from icheat_usd.edits.painting import mesh_texel_positions
+from icheat_usd.edits.painting import surface_texel_positions
 from icheat_usd.errors import EditError
 from icheat_usd.kernels import nearest as kernels
 from icheat_usd.scene import F32, F64, I32, I64, Finding, SceneSnapshot, Surface
@@ -111,12 +111,10 @@ def _carried_over(texels: F32, rest: F32, snapshot: SceneSnapshot, row: int) -> 
     "Nearest" counts a texel that faces away as further off, so that a thin
     wall does not take what was painted on its other side.
     """
-    geometry, surface = snapshot.geometry, snapshot.surfaces[row]
     resolution = texels.shape[1]
-    instances = np.flatnonzero(geometry.instance_surface == row)
-    if not len(instances) or not len(texels):
-        return np.zeros((surface.n_faces, resolution, resolution), np.float32)
-    now = mesh_texel_positions(snapshot, int(geometry.instance_mesh[instances[0]]), surface.n_faces, resolution)
+    now = surface_texel_positions(snapshot, row, resolution)
+    if not len(texels) or not now.size:
+        return np.zeros(now.shape[:3], np.float32)
     then = _spread(rest.astype(np.float64), resolution)
     found = _nearest(then.reshape(-1, 3), _normals(then), now.reshape(-1, 3).astype(np.float64), _normals(now))
     return np.asarray(texels.reshape(-1)[found].reshape(now.shape[:3]))

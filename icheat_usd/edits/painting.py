@@ -45,38 +45,45 @@ def paint_mask(snapshot: SceneSnapshot, paths: Iterable[str], brush: Brush, *, r
         None of the paths is a surface of the scene.
     """
     wanted = frozenset(paths)
-    surfaces, texels, rest = [], [], []
-    geometry = snapshot.geometry
-    for row, surface in enumerate(snapshot.surfaces):
-        if surface.path not in wanted:
-            continue
-        positions = np.zeros((surface.n_faces, resolution, resolution, 3), np.float32)
-        at_rest = np.zeros((surface.n_faces, 2, 2, 3), np.float32)
-        for instance in np.flatnonzero(geometry.instance_surface == row)[:1]:
-            mesh = int(geometry.instance_mesh[instance])
-            positions = mesh_texel_positions(snapshot, mesh, surface.n_faces, resolution)
-            at_rest = mesh_texel_positions(snapshot, mesh, surface.n_faces, 2)
-            matrix = geometry.instance_to_world[instance]
-            positions = (positions @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
-        weights = np.clip(brush(positions.reshape(-1, 3)), 0, 1)
-        texels.append((np.round(weights * 255) / np.float32(255)).astype(np.float32).reshape(positions.shape[:3]))
-        rest.append(at_rest)
-        surfaces.append(
-            MaskedSurface(surface.path, surface.n_faces, surface.instance_id, surface.part, surface.topology_digest)
-        )
-    if not surfaces:
+    rows = [row for row, surface in enumerate(snapshot.surfaces) if surface.path in wanted]
+    if not rows:
         raise EditError(f"nothing to paint: none of {sorted(wanted)} is a surface of {snapshot.stage_path}")
-    return SurfaceMask(tuple(surfaces), np.concatenate(texels), np.concatenate(rest))
+    texels = {row: _painted(snapshot, row, brush, resolution) for row in rows}
+    # What the brush did not touch needs no mention; a mask that is empty still says where it was painted.
+    touched = [row for row in rows if texels[row].any()] or rows
+    return SurfaceMask(
+        tuple(
+            MaskedSurface(surface.path, surface.n_faces, surface.instance_id, surface.part, surface.topology_digest)
+            for surface in (snapshot.surfaces[row] for row in touched)
+        ),
+        np.concatenate([texels[row] for row in touched]),
+        np.concatenate([surface_texel_positions(snapshot, row, 2) for row in touched]),
+    )
 
 
-def mesh_texel_positions(snapshot: SceneSnapshot, mesh: int, n_faces: int, resolution: int) -> F32:
-    """Texel centres on the control faces of one mesh, (n_faces, resolution, resolution, 3) in object space."""
-    geometry = snapshot.geometry
-    some = slice(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
-    face = geometry.face[some]
-    order = np.argsort(face, kind="stable")
-    begins = np.searchsorted(face[order], np.arange(n_faces + 1)).astype(np.int64)
-    points, uv = (np.ascontiguousarray(values[some][order]) for values in (geometry.points, geometry.face_uv))
+def _painted(snapshot: SceneSnapshot, row: int, brush: Brush, resolution: int) -> F32:
+    """Weights on one surface, (n_faces, resolution, resolution)."""
+    positions = surface_texel_positions(snapshot, row, resolution)
+    for instance in np.flatnonzero(snapshot.geometry.instance_surface == row)[:1]:
+        matrix = snapshot.geometry.instance_to_world[instance]
+        positions = (positions @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
+    weights = np.clip(brush(positions.reshape(-1, 3)), 0, 1)
+    return (np.round(weights * 255) / np.float32(255)).astype(np.float32).reshape(positions.shape[:3])
+
+
+def surface_texel_positions(snapshot: SceneSnapshot, row: int, resolution: int) -> F32:
+    """Texel centres on the control faces of one surface, (n_faces, resolution, resolution, 3) in object space.
+
+    0 for a surface that nothing shows.
+    """
+    geometry, n_faces = snapshot.geometry, snapshot.surfaces[row].n_faces
     positions = np.zeros((n_faces, resolution, resolution, 3), np.float32)
-    texel_positions(begins, points, uv, resolution, positions)
+    for instance in np.flatnonzero(geometry.instance_surface == row)[:1]:
+        mesh = geometry.instance_mesh[instance]
+        some = slice(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
+        face = geometry.face[some]
+        order = np.argsort(face, kind="stable")
+        begins = np.searchsorted(face[order], np.arange(n_faces + 1)).astype(np.int64)
+        points, uv = (np.ascontiguousarray(values[some][order]) for values in (geometry.points, geometry.face_uv))
+        texel_positions(begins, points, uv, resolution, positions)
     return positions

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from icheat_usd.edits import operations
-from icheat_usd.edits.model import Payload, SurfaceMask, Value
+from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask, Value
 from icheat_usd.edits.operations.constants import baked_constants
 from icheat_usd.errors import EditError
-from icheat_usd.scene import Finding
+from icheat_usd.scene import F32, F64, Finding
 from icheat_usd.session.authoring import read_payload
 from icheat_usd.session.origin import history_entry
 from icheat_usd.sidecar import write_payloads
@@ -315,19 +315,32 @@ class _Made:
         if len(masks) == 1 or all(_equal(mask, heaviest) for mask, _ in masks):
             return heaviest
         painted = [(mask, weight) for mask, weight in masks if mask is not None]
-        alike = len(painted) == len(masks) and all(
-            mask.surfaces == painted[0][0].surfaces and mask.texels.shape == painted[0][0].texels.shape
-            for mask, _ in painted
-        )
-        if heaviest is None or not alike:
-            message = (
-                f"the keys around frame {self.frame or 0.0:g} cover other surfaces; that of the nearer key is taken"
-            )
+        if heaviest is None or len(painted) < len(masks) or len({mask.resolution for mask, _ in painted}) > 1:
+            around = f"the keys around frame {self.frame or 0.0:g}"
+            message = f"{around} have masks of another kind; that of the nearer key is taken"
             self.findings.append(EditFinding(str(self.prim.GetPath()), side.replace("_", " "), message))
             return heaviest
-        total = sum(weight for _, weight in painted)
-        mixed = sum(weight / total * mask.texels.astype(np.float64) for mask, weight in painted)
-        return replace(heaviest, texels=(np.round(mixed * 255) / 255).astype(np.float32))
+        return _mean_mask(painted)
+
+
+def _mean_mask(masks: Sequence[tuple[SurfaceMask, float]]) -> SurfaceMask:
+    """Weighted mean; a surface that a mask does not name has weight 0 there."""
+    total = sum(weight for _, weight in masks)
+    mixed: dict[MaskedSurface, F64] = {}
+    rest: dict[MaskedSurface, F32 | None] = {}
+    for mask, weight in masks:
+        begin = 0
+        for surface in mask.surfaces:
+            some = slice(begin, begin + surface.n_faces)
+            mixed[surface] = mixed.get(surface, 0.0) + weight / total * mask.texels[some].astype(np.float64)
+            rest[surface] = rest.get(surface) if mask.rest is None else mask.rest[some]
+            begin += surface.n_faces
+    known = [places for places in rest.values() if places is not None]
+    return SurfaceMask(
+        tuple(mixed),
+        (np.round(np.concatenate(list(mixed.values())) * 255) / 255).astype(np.float32),
+        np.concatenate(known) if len(known) == len(rest) else None,
+    )
 
 
 def _equal(a: SurfaceMask | None, b: SurfaceMask | None) -> bool:

@@ -79,3 +79,13 @@ def test_a_mask_for_another_scene_or_topology_is_an_error():
     other = make_snapshot([Mesh([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], path="/other")])
     with pytest.raises(EditError, match="another scene"):
         masks_at(other, mask, points(other, [0], [[0, 0]]))
+
+
+def test_surfaces_that_the_brush_did_not_touch_are_not_kept():
+    far = Mesh([[[9, 0, 0], [10, 0, 0], [9, 1, 0]]], path="/far")
+    snapshot = make_snapshot([Mesh([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], path="/near"), far])
+    mask = paint_mask(snapshot, ["/near", "/far"], soft_sphere((0, 0, 0), 1, 2))
+    assert [surface.path for surface in mask.surfaces] == ["/near"] and len(mask.texels) == len(mask.rest) == 1
+    assert masks_at(snapshot, mask, points(snapshot, [1], [[0.2, 0.2]], instance=1))[0] == 0
+    nothing = paint_mask(snapshot, ["/near", "/far"], soft_sphere((0, 0, 9), 1, 2))
+    assert len(nothing.surfaces) == 2 and not nothing.texels.any()

@@ -284,3 +284,19 @@ def test_keys_of_a_variant_are_written_into_it_and_leave_the_others(stage: Usd.S
     listed = keys.list_keys(fresh, cool)
     assert [key.time for key in listed.keys] == [1.0, 21.0] and listed.interpolation == "smooth"
     assert not listed.copied_from
+
+
+def test_masks_of_two_keys_that_cover_other_surfaces_mix_with_nothing_where_one_has_none(stage: Usd.Stage) -> None:
+    session = Session.open(stage, camera="/World/camera", frame=1)
+    masks = []
+    for paths, value in ((SURFACES[:1], 1.0), (SURFACES[:2], 0.5)):
+        mask = paint_mask(session.snapshot, paths, lambda p, v=value: np.full(len(p), v))  # type: ignore[misc]
+        masks.append(mask)
+        keys.set_key(stage, WARM, layer="seq.usda", frame=10.0 * len(masks), receiver_mask=mask)
+    assert [len(mask.surfaces) for mask in masks] == [1, 2]
+    assert keys.set_key(stage, WARM, layer="seq.usda", frame=14) == ()
+    mixed = payload_at(stage, 14).receiver_mask
+    assert mixed is not None and mixed.rest is not None and mixed.rest.shape == (2, 2, 2, 3)
+    found = {surface.path: float(texels.mean()) for surface, texels in zip(mixed.surfaces, mixed.texels, strict=True)}
+    half = np.round(0.5 * 255) / 255
+    assert found == pytest.approx({SURFACES[0]: 0.6 + 0.4 * half, SURFACES[1]: 0.4 * half}, abs=0.51 / 255)
