@@ -14,7 +14,7 @@ import numpy as np
 
 from icheat_usd.edits import operations
 from icheat_usd.edits.binding import bind
-from icheat_usd.edits.model import Edit, EditStack
+from icheat_usd.edits.model import Blend, Edit, EditStack, Value
 from icheat_usd.edits.operations.base import Level
 from icheat_usd.errors import EditError
 from icheat_usd.image.film import Film
@@ -114,7 +114,7 @@ def explain_pixel(session: Session, x: int, y: int, *, n_casters: int = 5, rays:
     for edit in stack.active if lit else ():
         assert lit is not None
         change = base[2] - lit.light(_without(stack, edit))[2]
-        casters = lit.casters(stack, edit, n_casters) if change.any() else ()
+        casters = lit.casters(stack, edit, n_casters, change) if change.any() else ()
         shares[edit.path] = _share(session, edit, _rgb(change), lit.mask(edit), casters, True)
     none = (0.0, 0.0, 0.0), 0.0, ()
     edits = tuple(shares.get(edit.path) or _share(session, edit, *none, stack.enabled) for edit in stack.edits)
@@ -153,23 +153,28 @@ class _PixelLight:
         part = self.view.throughput.astype(np.float64) @ _LUMINANCE
         return float(of_sample @ part / max(float(part.sum()), 1e-30))
 
-    def casters(self, stack: EditStack, edit: Edit, n: int) -> tuple[CasterShare, ...]:
-        """What the edit changes from each caster alone, the largest change first.
+    def casters(self, stack: EditStack, edit: Edit, n: int, change: F64) -> tuple[CasterShare, ...]:
+        """What of an edit's change is due to each caster, the largest first.
 
-        Nothing for edits of all light, which have no casters. Those of the light of all casters together change it
-        by more or less than the sum of what they change from each.
+        An edit of pairs is applied to each caster alone. One of the light of all casters together changes all of it
+        by one factor, so each has as much of the change as it has of the light. One of all light has no casters.
         """
         operation = operations.find(edit.operation)
         if operation is not None and operation.level is Level.VIEW:
             return ()
+        measured, factor = edit, np.ones(3)
+        if operation is not None and operation.level is Level.AGGREGATE:
+            measured = _doubling(edit)
         without = self.light(_without(stack, edit))[2]
+        if measured is not edit:
+            light = self.light(_with(stack, edit, measured))[2] - without
+            factor = np.divide(change, light, out=np.zeros(3), where=light > 0)
         found = []
         for path in self._brightest(edit):
-            alone = replace(edit, casters=replace(edit.casters, paths=edit.casters.paths & {path}))
-            stacked = replace(stack, edits=tuple(alone if e is edit else e for e in stack.edits))
-            change = self.light(stacked)[2] - without
-            if change.any():
-                found.append(CasterShare(path, _rgb(change)))
+            alone = replace(measured, casters=replace(edit.casters, paths=edit.casters.paths & {path}))
+            part = factor * (self.light(_with(stack, edit, alone))[2] - without)
+            if part.any():
+                found.append(CasterShare(path, _rgb(part)))
         return tuple(sorted(found, key=lambda share: -np.abs(share.change) @ _LUMINANCE)[:n])
 
     def _brightest(self, edit: Edit) -> list[str]:
@@ -217,6 +222,19 @@ def _relighter(session: Session, view: ViewSamples, rays: int) -> Relighter:
 
 def _without(stack: EditStack, edit: Edit) -> EditStack:
     return replace(stack, edits=tuple(other for other in stack.edits if other is not edit))
+
+
+def _with(stack: EditStack, edit: Edit, other: Edit) -> EditStack:
+    """The stack with another edit in the place of one of its own."""
+    return replace(stack, edits=tuple(other if e is edit else e for e in stack.edits))
+
+
+def _doubling(edit: Edit) -> Edit:
+    """An edit that adds the light of the casters once more, where the given one changes it."""
+    gain: dict[str, Value] = {"gain": 2.0}
+    payloads = [key.payload and replace(key.payload, operation="scale", parameters=gain) for key in edit.keys]
+    keys = tuple(replace(key, payload=payload) for key, payload in zip(edit.keys, payloads, strict=True))
+    return replace(edit, operation="scale", parameters=gain, keys=keys, amount=1.0, blend=Blend.COMPOSE)
 
 
 def _share(

@@ -7,7 +7,7 @@ import pytest
 
 from icheat_usd.errors import EditError
 from icheat_usd.image.contact import GREY, contact_sheet, signed_image
-from icheat_usd.session import Quality, Session
+from icheat_usd.session import Quality, Session, soft_sphere
 from icheat_usd.session.explain import contribution_film, explain_pixel
 from tests.session.test_session import ROOM, open_shot, shot  # noqa: F401  a fixture
 
@@ -69,6 +69,22 @@ def test_casters_share_an_edit_by_what_they_send(session):
     total = np.sum([caster.change for caster in share.casters], axis=0)
     np.testing.assert_allclose(total, share.change, rtol=1e-4, atol=1e-6)
     assert explain_pixel(session, x, y, n_casters=1).edits[-1].casters[0].path == "/World/Room"
+
+
+def test_casters_share_an_edit_of_their_light_together_by_their_light(session):
+    session.mute_edit("/World/Edits/warm", layer="shot.usda")
+    session.mute_edit("/World/Edits/grey", layer="shot.usda")
+    everything = {"receivers": ["/World/Room"], "casters": ["/World"], "layer": "shot.usda"}
+    brush = soft_sphere((0, -2, 0), 0.5, 3.0)
+    session.add_edit(
+        "contrast", operation="gamma", parameters={"exponent": 2.0}, receiver_brush=brush, frame=1, **everything
+    )
+    film = contribution_film(session)
+    x, y = brightest(film.layer("edit.contrast"))
+    share = explain_pixel(session, x, y).edits[-1]
+    total = np.sum([caster.change for caster in share.casters], axis=0)
+    assert len(share.casters) == 2
+    np.testing.assert_allclose(total, share.change, rtol=1e-3, atol=1e-6)
 
 
 def test_a_pixel_that_no_edit_reaches_says_so(session):
