@@ -42,22 +42,22 @@ def _child_mean(child, c, values, mean):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _keep_largest(left, right, weight, node_weight, values, mean, peak, n_kept, kept):  # type: ignore[no-untyped-def]
-    """Flag the `n_kept` coefficients of largest norm over the columns, each column in units of its peak."""
+def _keep_largest(left, right, weight, node_weight, values, mean, unit, n_kept, kept):  # type: ignore[no-untyped-def]
+    """Flag the `n_kept` coefficients of largest norm over the columns, each column in its unit."""
     n_nodes, k = len(left), values.shape[1]
     norm = np.zeros(n_nodes + 1, np.float64)
     for c in range(k):
-        if peak[c] > 0:
+        if unit[c] > 0:
             root = mean[0, c] if n_nodes > 0 else np.float64(values[0, c])
             total = node_weight[0] if n_nodes > 0 else weight[0]
-            norm[0] += (root / peak[c]) ** 2 * total
+            norm[0] += (root / unit[c]) ** 2 * total
     for node in range(n_nodes):
         a = child_weight(left[node], weight, node_weight)
         b = child_weight(right[node], weight, node_weight)
         for c in range(k):
-            if peak[c] > 0:
+            if unit[c] > 0:
                 difference = _child_mean(left[node], c, values, mean) - _child_mean(right[node], c, values, mean)
-                norm[1 + node] += (difference / peak[c]) ** 2 * (a * b / (a + b))
+                norm[1 + node] += (difference / unit[c]) ** 2 * (a * b / (a + b))
     order = np.argsort(-norm, kind="mergesort")
     for e in range(min(n_kept, n_nodes + 1)):
         if norm[order[e]] > 0:
@@ -94,7 +94,7 @@ def encode_rows(  # type: ignore[no-untyped-def]
 
     With `n_kept` < 0, nodes are divided from the root down until every leaf
     below is within `tolerance` (k,) of what is decoded there, quantisation
-    included; else the `n_kept` largest coefficients are kept. Row r gets
+    included; else the `n_kept` largest coefficients are kept, in units of it. Row r gets
     ``count[r]`` entries ``index[r]``, ascending, and ``number[r]``
     (., k), integers of at most `largest` that multiply ``step[r]`` (k,).
     ``error[r]`` (k,) is the largest difference at any leaf.
@@ -135,7 +135,10 @@ def encode_rows(  # type: ignore[no-untyped-def]
         kept = np.zeros(n_nodes + 1, np.uint8)
         kept_before = np.zeros(n_nodes + 2, np.int64)
         if n_kept >= 0:
-            _keep_largest(left, right, weight, node_weight, row, mean, peak, n_kept, kept)
+            unit = np.empty(k, np.float64)
+            for c in range(k):
+                unit[c] = tolerance[c] if tolerance[c] > 0.0 else peak[c]
+            _keep_largest(left, right, weight, node_weight, row, mean, unit, n_kept, kept)
             for e in range(n_nodes + 1):
                 kept_before[e + 1] = kept_before[e] + kept[e]
 

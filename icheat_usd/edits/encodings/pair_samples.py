@@ -40,7 +40,7 @@ class PairSamples:
         self.touched: Bool = np.asarray(np.any(self.receivers.masks > 0, axis=0), np.bool_)
         b = np.ones((gather.n, 3), np.float32) if radiance is None else radiance
         self.resolved, self.lost = _resolve(field, self.receivers, casters, b, transport)
-        self._casters, self._radiance = casters, b
+        self._casters, self._radiance, self._is_lit = casters, b, radiance is not None
         self.kinds = KINDS if field.has_offset else KINDS[:2]
         self.varies = field.uses_receiver or bool(self.resolved) or field.has_offset
         self.is_product = not self.varies and field.n_rows == 1
@@ -121,7 +121,9 @@ class PairSamples:
             peak = np.abs(self.pairs(some, tests)).max(axis=(0, 1))
         result = np.full(len(peak), epsilon, np.float64)
         for k in range(1, len(self.kinds)):
-            result[3 * k : 3 * k + 3] *= max(float(peak[3 * k : 3 * k + 3].max()), 1e-30)
+            # Emission that is lost in what the casters send anyway is rounding of the operation's.
+            least = 1e-3 * float(self._radiance.mean()) if self.kinds[k] == "emission" and self._is_lit else 1e-30
+            result[3 * k : 3 * k + 3] *= max(float(peak[3 * k : 3 * k + 3].max()), least)
         return result
 
     def judged(self, tests: I64, allowed: F64, progress: Progress) -> F32:

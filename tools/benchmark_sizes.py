@@ -1,0 +1,132 @@
+"""Sizes and errors of edits in files: the encoding that is chosen, and sampled rows that are forced."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def made_up_edits(session: Any) -> dict[str, Any]:
+    """Edits of objects and of brushes between what the camera sees most of, and what it is lit by most."""
+    from icheat_usd.edits.model import Edit, KeyedPayload, Payload, Selection
+    from icheat_usd.edits.painting import paint_mask, soft_sphere
+
+    snapshot, view, gather = session.snapshot, session.view, session.gather
+    surface = snapshot.geometry.instance_surface
+    seen = np.bincount(surface[view.points.instance], minlength=len(snapshot.surfaces))
+    sending = np.bincount(surface[gather.points.instance], minlength=len(snapshot.surfaces))
+    receivers = [snapshot.surfaces[i].path for i in np.argsort(-seen)[:4]]
+    casters = [snapshot.surfaces[i].path for i in np.argsort(-sending)[:8]]
+
+    def one(name: str, operation: str, parameters: dict[str, Any], us: list[str], ws: list[str]) -> Any:
+        return Edit(f"/{name}", operation, parameters, Selection(frozenset(us)), Selection(frozenset(ws)))
+
+    def painted(edit: Any, side: str) -> Any:
+        points = view.points if side == "receiver_mask" else gather.points
+        paths = edit.receivers.paths if side == "receiver_mask" else edit.casters.paths
+        on = np.isin(surface[points.instance], [i for i, s in enumerate(snapshot.surfaces) if s.path in paths])
+        position = points.position[on]
+        radius = 0.5 * float(np.linalg.norm(position.std(axis=0)) + 1e-3)
+        centre = tuple(float(x) for x in np.median(position, axis=0))
+        mask = paint_mask(snapshot, paths, soft_sphere(centre, 0.3 * radius, 2 * radius))
+        payload = edit.keys[0].payload if edit.keys else Payload(edit.operation, edit.parameters)
+        return replace(edit, keys=(KeyedPayload(replace(payload, **{side: mask}), 1.0),))
+
+    brush = painted(
+        one("brush", "scale", {"gain": 2.0, "color": (1.0, 0.8, 0.6)}, receivers[:2], casters[:2]), "receiver_mask"
+    )
+    return {
+        "object scale": one("objects", "scale", {"gain": 0.5}, receivers, casters),
+        "object hsv": one("hue", "hsv", {"hue": 40.0, "saturation": 1.5}, receivers, casters[:4]),
+        "brush scale": painted(brush, "caster_mask"),
+        "brush hsv": painted(one("dab", "hsv", {"hue": -60.0}, receivers[:2], casters[:2]), "receiver_mask"),
+        "falloff": one("falloff", "falloff", {"exponent": 1.0}, receivers[:1], casters[:2]),
+    }
+
+
+def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Bake made-up edits of one stage in all ways; one line each."""
+    from icheat_usd.edits.binding import bind
+    from icheat_usd.edits.encodings.bake import at_full_amount, bake_field
+    from icheat_usd.edits.encodings.choose import choose
+    from icheat_usd.edits.model import EditStack, KeyedPayload, Payload
+    from icheat_usd.edits.operations import find
+    from icheat_usd.edits.operations.constants import baked_constants
+    from icheat_usd.session import Quality, Session
+    from icheat_usd.sidecar import write_payloads
+
+    stage = arguments.stages[0]
+    size = {"width": arguments.width, "height": arguments.height}
+    session = Session.open(stage, quality=Quality(n_gather=arguments.gather), **size)
+    snapshot, view, gather = session.snapshot, session.view, session.gather
+    print(f"  {view.n:,} view samples, {gather.n:,} gather samples", flush=True)
+    rows: list[dict[str, Any]] = []
+
+    def stored(payload: Payload) -> int:
+        with tempfile.TemporaryDirectory() as folder:
+            return os.path.getsize(write_payloads(folder, [payload], anchor="/")[0])
+
+    def image_error(edit: Any, baked: Any) -> dict[str, float]:
+        as_rows = replace(
+            edit, operation="baked", parameters={}, keys=(KeyedPayload(Payload(edit.operation, {}, rows=baked), 1.0),)
+        )
+        exact = session.relighter.relight(bind(EditStack("/s", (edit,)), snapshot))
+        found = session.relighter.relight(bind(EditStack("/s", (as_rows,)), snapshot))
+        off = np.abs(found.indirect_edited - exact.indirect_edited)
+        lit = exact.indirect > 1e-3 * exact.indirect.mean()
+        return {
+            "image_error_max": float((off[lit] / exact.indirect[lit]).max()),
+            "image_error_rms": float(np.sqrt((off**2).mean() / (exact.indirect**2).mean())),
+            "edit_rms": float(
+                np.sqrt(((exact.indirect_edited - exact.indirect) ** 2).mean() / (exact.indirect**2).mean())
+            ),
+        }
+
+    for name, edit in made_up_edits(session).items():
+        operation = find(edit.operation)
+        assert operation is not None
+        complete = operation.complete(edit.parameters, edit.path)
+        payload = edit.keys[0].payload if edit.keys else Payload(edit.operation, edit.parameters)
+        payload = replace(payload, **baked_constants(operation, complete))
+        row: dict[str, Any] = {"edit": name, "chosen": choose(edit.operation, complete).value, "bytes": stored(payload)}
+        print(f"  {name:<14} {row['chosen']:<8} {row['bytes'] / 1e6:8.3f} MB", flush=True)
+        field = bind(at_full_amount(edit), snapshot)
+        radiance = session.cell_light.total() if field.uses_incident else None
+        for form, options in (
+            ("epsilon", {"epsilon": arguments.epsilon}),
+            ("coefficients", {"coefficients": arguments.coefficients}),
+        ):
+            start = time.perf_counter()
+            baked = bake_field(field, view, gather, snapshot, where=name, radiance=radiance, **options)
+            found: dict[str, Any] = {
+                "seconds": time.perf_counter() - start,
+                "bytes": stored(replace(payload, rows=baked.rows)),
+                "sites": len(baked.rows.site_row),
+                "rows": len(baked.rows.row_pattern),
+                "entries": len(baked.rows.indices),
+                "epsilon_scale": baked.rows.epsilon_scale,
+                "measured": baked.measured,
+            }
+            if arguments.images:
+                found |= image_error(edit, baked.rows)
+            row[form] = found
+            value = next(iter(options.values()))
+            print(
+                f"    rows, {form} {value}: {found['bytes'] / 1e6:.3f} MB, {found['seconds']:.1f} s,"
+                f" {found['sites']:,} sites, scale within {found['epsilon_scale']:.2g}, seen {found['measured']:.2g}"
+                + (
+                    f", image max {found['image_error_max']:.2g} rms {found['image_error_rms']:.2g}"
+                    if arguments.images
+                    else ""
+                ),
+                flush=True,
+            )
+        rows.append(row)
+    return {"stage": Path(stage).name, **size, "gather_samples": gather.n, "edits": rows}
