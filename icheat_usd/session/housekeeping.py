@@ -10,7 +10,6 @@ import json
 import os
 import time as clock
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +18,7 @@ from icheat_usd import sidecar
 from icheat_usd.errors import EditError, SidecarError, StageError
 from icheat_usd.session.origin import history_entry
 from icheat_usd.sidecar import SUFFIX
+from icheat_usd.sidecar.writer import write_text_beside
 from icheat_usd.stage.sidecar_uses import (
     LAYER_SUFFIXES,
     TRASH,
@@ -274,27 +274,5 @@ def manifest_path(file: str) -> str:
 
 
 def write_manifest(file: str, content: Mapping[str, object]) -> str:
-    """Write the manifest of a published file, complete or not at all, read-only.
-
-    Raises
-    ------
-    SidecarError
-        It exists or cannot be written.
-    """
-    path = Path(manifest_path(file))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.icheat-tmp")
-    try:
-        with temporary.open("w", encoding="utf-8") as opened:
-            opened.write(json.dumps(content, indent=2) + "\n")
-            opened.flush()
-            os.fsync(opened.fileno())
-        os.chmod(temporary, 0o444)
-        if path.exists():
-            raise SidecarError(f"{path} exists, and manifests are never overwritten; publish under another name")
-        os.replace(temporary, path)
-    except OSError as problem:
-        raise SidecarError(f"{path} cannot be written ({problem.strerror}); check permissions and space") from problem
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
-    return str(path)
+    """Write the manifest of a published file, read-only. Raises `SidecarError` where it exists or cannot be written."""
+    return str(write_text_beside(Path(file), MANIFEST_SUFFIX, json.dumps(content, indent=2) + "\n"))

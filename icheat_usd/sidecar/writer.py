@@ -169,7 +169,7 @@ def make_file(beside: Path, fill: Callable[[h5py.Group], None], *, mode: int | N
     if exact and beside.exists():
         raise SidecarError(f"{beside}: exists, and sidecars are never overwritten; choose an unused name")
     _remove_abandoned(folder, stem)
-    temporary = folder / f".{stem}.{socket.gethostname()}.{os.getpid()}.{secrets.token_hex(4)}.icheat-tmp"
+    temporary = _temporary(folder, stem)
     try:
         # Created by name with the usual mode, not by mkstemp, so that the umask decides who may read the file.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -198,6 +198,37 @@ def make_file(beside: Path, fill: Callable[[h5py.Group], None], *, mode: int | N
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+def write_text_beside(sidecar: Path, suffix: str, content: str) -> Path:
+    """Write a read-only text file called as a sidecar but for its suffix, complete or not at all.
+
+    Raises
+    ------
+    SidecarError
+        It exists or cannot be written.
+    """
+    final = sidecar.with_name(sidecar.name.removesuffix(SUFFIX) + suffix)
+    # Called as those of the sidecar's own versions, so that their next writer removes what a killed one left.
+    temporary = _temporary(final.parent, re.sub(r"\.v\d+$", "", sidecar.name.removesuffix(SUFFIX)))
+    try:
+        with temporary.open("x", encoding="utf-8") as opened:
+            opened.write(content)
+        _flush(temporary)
+        os.chmod(temporary, 0o444)
+        if not _give_name(temporary, final):
+            raise SidecarError(f"{final} exists, and is never overwritten; choose an unused name")
+        _flush(final.parent)
+        return final
+    except OSError as problem:
+        raise SidecarError(f"{final} cannot be written ({problem.strerror}); check permissions and space") from problem
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def _temporary(folder: Path, stem: str) -> Path:
+    return folder / f".{stem}.{socket.gethostname()}.{os.getpid()}.{secrets.token_hex(4)}.icheat-tmp"
 
 
 def _give_unused_name(temporary: Path, folder: Path, stem: str) -> Path:

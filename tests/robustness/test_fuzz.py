@@ -15,17 +15,17 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="what is opened 
 
 
 def test_mutated_sidecars_are_refused_or_read(tmp_path: Path) -> None:
-    tally = run("sidecar", 0, 1200, tmp_path)
+    tally = run("sidecar", 0, 800, tmp_path)
     assert not tally.faults, str(tally)
-    assert tally.n_cases == 1200 and tally.refused > 600 and tally.accepted > 60
+    assert tally.n_cases == 800 and tally.refused > 400 and tally.accepted > 60
     # Payloads here declare 8 MiB at most, so that reading may take twice that and two chunks of 1 MiB.
     assert tally.memory_bytes < 24 << 20
 
 
 def test_mutated_layers_are_refused_or_read(tmp_path: Path) -> None:
-    tally = run("layer", 0, 300, tmp_path)
+    tally = run("layer", 0, 250, tmp_path)
     assert not tally.faults, str(tally)
-    assert tally.n_cases == 300 and tally.refused > 60 and tally.accepted > 60
+    assert tally.n_cases == 250 and tally.refused > 60 and tally.accepted > 60
 
 
 def test_a_crash_and_a_hang_would_be_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

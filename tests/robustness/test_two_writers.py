@@ -12,7 +12,7 @@ from tests.robustness.writer import edits, make_stage, verify_sidecars
 
 ROOT = Path(__file__).parents[2]
 
-N_EDITS = 12
+N_EDITS = 25
 
 
 @pytest.mark.parametrize("layers", [("shot.usda", "shot.usda"), ("shot.usda", "scene.usda")])
@@ -29,7 +29,13 @@ def test_two_writers_at_once_lose_nothing_in_silence(layers: tuple[str, str], tm
         )
         for layer, name in zip(layers, ("ann", "bob"), strict=True)
     ]
-    said = [process.communicate("go\n", timeout=120) for process in processes]
+    for process in processes:  # both have imported everything and wait
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    for process in processes:
+        assert process.stdin is not None
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    said = [process.communicate(timeout=120) for process in processes]
     assert [process.returncode for process in processes] == [0, 0], said
     lines = [line for out, _ in said for line in out.splitlines()]
     kept = {line.split()[1] for line in lines if line.startswith("kept ")}

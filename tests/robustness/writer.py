@@ -1,6 +1,6 @@
 """A process that authors edits and may be killed on the way: run by `test_killed.py` and `test_two_writers.py`.
 
-    python -m tests.robustness.writer sweep FOLDER
+    python -m tests.robustness.writer sweep FOLDER add|publish STRIDE
     python -m tests.robustness.writer loop COUNT STAGE LAYER NAME
 
 `sweep` has writers end without any clean-up before and after every write,
@@ -25,7 +25,7 @@ from pxr import Sdf
 
 from icheat_usd.edits.model import MaskedSurface, SurfaceMask
 from icheat_usd.errors import IcheatError
-from icheat_usd.session import authoring, housekeeping, inspection
+from icheat_usd.session import authoring, housekeeping, inspection, publishing
 from icheat_usd.sidecar import list_payloads, read_payload
 
 KILLED = 86
@@ -140,15 +140,27 @@ def _forked(action: Callable[[], None]) -> int:
         os._exit(1)
 
 
-def _killed_at(stage: Path, step: int) -> None:
+def publish(stage_file: str) -> None:
+    """Publish and repoint, as `icheat publish --layer` does."""
+    published = publishing.publish(inspection.open_stage(stage_file), layers=[stage_file])
+    assert published.file and not published.findings, published.findings
+
+
+def _killed_at(stage: Path, step: int, verb: str) -> None:
     fuse = _Fuse(step)
     fuse.install()
-    add(str(stage), "shot.usda", "late")
+    if verb == "publish":
+        publish(str(stage))
+    else:
+        add(str(stage), "shot.usda", "late")
     (stage.parent / "steps").write_text(str(fuse.count))
 
 
 def _look(folder: Path) -> None:
     """What a killed writer left: all that was committed, and nothing that stops the next writer."""
+    if (folder / "publishing").exists():
+        _look_after_publish(folder)
+        return
     before = edits(folder / "shot.usda")
     assert before in (["early"], ["early", "late"]), before
     assert verify_sidecars(folder) >= len(before)
@@ -162,17 +174,33 @@ def _look(folder: Path) -> None:
     print("late" if "late" in before else "early", len(collected.unnamed), flush=True)
 
 
-def sweep(folder: Path) -> None:
-    """Kill a writer at every step, and look at what it left; prints one line for each."""
+def _look_after_publish(folder: Path) -> None:
+    assert edits(folder / "shot.usda") == ["early"]
+    n_files = verify_sidecars(folder)
+    published = "published" in (folder / "shot.usda").read_text()
+    publish(str(folder / "shot.usda"))
+    assert edits(folder / "shot.usda") == ["early"] and verify_sidecars(folder) == n_files + 1
+    left = [path.name for path in folder.iterdir() if path.name.startswith(".")]
+    assert not left, left
+    # Without its manifest too a published file says itself that it is one.
+    collected = housekeeping.collect([str(folder)], min_age_hours=0.0)
+    assert not collected.problems and all("published" not in item.file for item in collected.unnamed), collected
+    print("repointed" if published else "as before", n_files, flush=True)
+
+
+def sweep(folder: Path, verb: str, stride: int) -> None:
+    """Kill a writer at every step, or every so many, and look at what it left; prints one line for each."""
     make_stage(folder / "start")
     assert _forked(lambda: add(str(folder / "start" / "shot.usda"), "shot.usda", "early")) == 0
-    step = 0
+    if verb == "publish":
+        (folder / "start" / "publishing").touch()
+    step = 1 - stride
     while True:
-        step += 1
+        step += stride
         place = Path(shutil.copytree(folder / "start", folder / "killed"))
-        status = _forked(lambda place=place, step=step: _killed_at(place / "shot.usda", step))  # type: ignore[misc]
+        status = _forked(lambda place=place, step=step: _killed_at(place / "shot.usda", step, verb))  # type: ignore[misc]
         if status == 0:
-            assert int((place / "steps").read_text()) == step - 1
+            assert step - stride <= int((place / "steps").read_text()) < step
             return
         assert status == KILLED, f"step {step}: the writer ended with {status}"
         assert _forked(lambda place=place: _look(place)) == 0, f"step {step}"  # type: ignore[misc]
@@ -181,6 +209,7 @@ def sweep(folder: Path) -> None:
 
 def loop(count: int, stage: str, layer: str, name: str) -> None:
     """Add edits one after the other; says which were kept, and of which the user was told that they were not."""
+    print("ready", flush=True)
     sys.stdin.readline()  # both writers start at the same moment
     for index in range(count):
         try:
@@ -192,6 +221,6 @@ def loop(count: int, stage: str, layer: str, name: str) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1] == "sweep":
-        sweep(Path(sys.argv[2]))
+        sweep(Path(sys.argv[2]), sys.argv[3], int(sys.argv[4]))
     else:
         loop(int(sys.argv[2]), *sys.argv[3:])

@@ -16,6 +16,7 @@ import pytest
 from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask
 from icheat_usd.sidecar import (
     History,
+    list_aliases,
     list_payloads,
     pack,
     payload_digest,
@@ -159,6 +160,13 @@ def test_a_stranger_with_nothing_but_h5py_reads_and_writes_what_we_do(tmp_path: 
     assert read_history(out) == (History("a stranger", "to see", "2026-11-21T19:30:00Z", tuple(said["names"])),)
     packed, digests = pack([out], tmp_path / "packed.icheat.h5")
     assert digests == sorted(said["names"])
+
+
+def test_a_stranger_verifies_every_golden_file(stranger: dict[str, Any]) -> None:
+    files = sorted((ROOT / "tests" / "golden").rglob("*.icheat.h5"))
+    assert len(files) >= 4
+    for file in files:
+        assert set(stranger["read"](file)) == {*list_payloads(file), *list_aliases(file)}
 
 
 def test_a_stranger_reads_the_golden_files_with_plain_h5py(stranger: dict[str, Any]) -> None:
