@@ -45,6 +45,7 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
             metavar="X,Y,Z,INNER,OUTER",
             help=f"paint the {side}s anew: full within INNER of the point, none beyond OUTER; metres, stage axes",
         )
+    make.add_argument("--always", action="store_true", help="one payload for all times, in place of every key")
     make.add_argument("--identity", action="store_true", help="let the edit do nothing at this key")
     make.add_argument(
         "--interpolation",
@@ -88,9 +89,11 @@ def set_command(options: argparse.Namespace) -> int:
     stage, layer = open_for_writing(options)
     _, edit = named_edit(stage, options)
     spheres = {side: getattr(options, f"{side}_sphere") for side in ("receiver", "caster")}
-    if options.frame is None:
+    if options.always and options.frame is not None:
+        raise EditError("--always is for all times and --frame for one; give one of them")
+    if options.frame is None and not options.always:
         if options.set or options.identity or any(spheres.values()) or options.interpolation is None:
-            raise EditError("a key needs its time: give --frame, or --interpolation alone")
+            raise EditError("a key needs its time: give --frame, or --always; or --interpolation alone")
         findings = keys.set_interpolation(
             stage, edit, layer=layer, interpolation=options.interpolation, variant=options.variant
         )

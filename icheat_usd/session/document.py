@@ -357,7 +357,7 @@ class Session:
         edit: str,
         *,
         layer: str,
-        frame: float,
+        frame: float | None,
         receiver_brush: Brush | None = None,
         caster_brush: Brush | None = None,
         **values: Any,
@@ -370,7 +370,9 @@ class Session:
             Masks for this key, painted on what the edit selects, as it stands at `frame`.
         """
         if receiver_brush is not None or caster_brush is not None:
-            shot = self if self.frame == frame else Session.open(self.stage, camera=self.camera, frame=frame)
+            shot = self
+            if frame is not None and self.frame != frame:
+                shot = Session.open(self.stage, camera=self.camera, frame=frame)
             selected = next(found for found in self.stack.edits if found.path == edit)
             for side, selection, brush in (
                 ("receiver_mask", selected.receivers, receiver_brush),

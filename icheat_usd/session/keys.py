@@ -69,7 +69,7 @@ def set_key(
     edit: str,
     *,
     layer: str,
-    frame: float,
+    frame: float | None,
     parameters: Mapping[str, Value] | None = None,
     receiver_mask: SurfaceMask | None = None,
     caster_mask: SurfaceMask | None = None,
@@ -88,6 +88,7 @@ def set_key(
     Parameters
     ----------
     frame : stage time
+        None sets one payload for all times, in place of every key.
     parameters
         Values at this key.
     receiver_mask, caster_mask : SurfaceMask, optional
@@ -137,7 +138,7 @@ def set_key(
 
 def _set_payloads(
     made: _Made,
-    frame: float,
+    frame: float | None,
     masks: tuple[SurfaceMask | None, SurfaceMask | None],
     target: Any,
     made_against: Mapping[str, str | float | int],
@@ -148,10 +149,12 @@ def _set_payloads(
 ) -> tuple[Finding, ...]:
     stage, edit = made.prim.GetStage(), str(made.prim.GetPath())
     kept = made.unchanged_payload() if masks == (None, None) else None
-    payloads = {} if kept else {frame: made.payload(masks, made_against), **made.other_payloads()}
+    payloads: dict[float | None, Payload] = {}
+    if kept is None:
+        payloads = {frame: made.payload(masks, made_against), **made.other_payloads()}
     file: Path | None = None
     try:
-        named: dict[float, tuple[str | Path, str]] = {frame: kept} if kept else {}
+        named: dict[float | None, tuple[str | Path, str]] = {frame: kept} if kept else {}
         if payloads:
             beside = sidecar or target.realPath
             if not beside:
@@ -282,10 +285,11 @@ class _Made:
         made = Payload(self.operation, complete, receiver, caster, made_against=made_against)
         return self._baked(made)
 
-    def other_payloads(self) -> dict[float, Payload]:
+    def other_payloads(self) -> dict[float | None, Payload]:
         """By time: payloads of the other keys with the values, so far authored, of parameters that are keyed now."""
-        others: dict[float, Payload] = {}
-        assert self.frame is not None
+        others: dict[float | None, Payload] = {}
+        if self.frame is None:
+            return others  # One payload for all times leaves no other key.
         for key in self._keys if self._newly_keyed else ():
             if not key.digest or key.time is None or abs(key.time - self.frame) <= SAME_TIME:
                 continue

@@ -300,3 +300,25 @@ def test_masks_of_two_keys_that_cover_other_surfaces_mix_with_nothing_where_one_
     found = {surface.path: float(texels.mean()) for surface, texels in zip(mixed.surfaces, mixed.texels, strict=True)}
     half = np.round(0.5 * 255) / 255
     assert found == pytest.approx({SURFACES[0]: 0.6 + 0.4 * half, SURFACES[1]: 0.4 * half}, abs=0.51 / 255)
+
+
+def test_a_shot_replaces_the_payload_for_all_times_and_keeps_its_masks(stage: Usd.Stage) -> None:
+    keys.set_key(stage, WARM, layer="seq.usda", frame=1, parameters={"gain": 2.0})
+    keys.set_key(stage, WARM, layer="seq.usda", frame=9, parameters={"gain": 4.0})
+    painted = payload_at(stage, 1).receiver_mask
+    keys.set_key(stage, WARM, layer="shot.usda", frame=None, parameters={"gain": 7.0})
+    assert gains(stage, 1) == gains(stage, 5) == gains(stage, 9) == [(7.0, 1.0)]
+    assert [key.time for key in keys.list_keys(stage, WARM).keys] == [None]
+    kept = payload_at(stage, 5).receiver_mask
+    assert kept is not None and painted is not None and np.array_equal(kept.texels, painted.texels)
+    assert layer(stage, "seq.usda").GetNumTimeSamplesForPath(f"{WARM}.icheat:payload") == 2
+
+
+def test_the_command_line_sets_one_payload_for_all_times(
+    stage: Usd.Stage, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shot = str(tmp_path / "shot.usda")
+    assert run(["key", "set", shot, "warm", "--always", "--set", "gain=6", "--layer", "shot.usda"]) == 0
+    assert gains(open_stage(shot), 3) == [(6.0, 1.0)]
+    assert run(["key", "set", shot, "warm", "--always", "--frame", "3", "--layer", "shot.usda"]) == 2
+    assert "give one of them" in capsys.readouterr().err
