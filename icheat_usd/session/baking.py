@@ -25,6 +25,7 @@ from icheat_usd.edits.operations import Level, find
 from icheat_usd.errors import EditError
 from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import Finding
+from icheat_usd.session.authoring import anchor_of
 from icheat_usd.session.document import Session
 from icheat_usd.session.inspection import describe_stack
 from icheat_usd.session.keys import payload_at
@@ -228,7 +229,7 @@ def flatten_stack(
         if largest_error(work, keys, session.snapshot) > allowed:
             baked[middle] = _bake_stack(sessions, middle, stack_path, epsilon, coefficients)
             pending += [(low, middle), (middle, high)]
-    anchor = _anchor(stage)
+    anchor = anchor_of(stage)
     if not any(baked.values()):
         raise EditError(f"{stack_path}: none of its edits does anything at these frames; choose others with --frames")
     made = []
@@ -431,11 +432,6 @@ def _described(path: str, key: _Key, file: Path, digest: str) -> BakedKey:
         measured_error=key.baked.measured,
         lost_radiance=key.baked.lost,
     )
-
-
-def _anchor(stage: Any) -> str:
-    default = stage.GetDefaultPrim()
-    return str(default.GetPath()) if default else "/"
 
 
 def _save(target: Any) -> None:

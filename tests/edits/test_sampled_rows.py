@@ -137,7 +137,30 @@ def test_the_image_is_off_by_at_most_the_bound_of_the_unedited_indirect_light():
         assert np.array_equal(rows.indirect_edited[untouched], exact.indirect[untouched])
 
 
-def test_amount_and_blend_stay_live():
+def final_error(one: Edit, found: BakedRows) -> float:
+    """RMS difference of the final gather between rows and recipe, relative to what the recipe changes."""
+    pipe = pipeline()
+    exact = pipe.final(one, samples=1, rays=64, light_samples=2)
+    rows = pipe.final(as_baked(one, (found, 1.0)), samples=1, rays=64, light_samples=2)
+    assert np.array_equal(exact.indirect, rows.indirect)
+    changed = exact.indirect_edited - exact.indirect
+    assert np.abs(changed).max() > 0.01
+    return float(np.linalg.norm(rows.indirect_edited - exact.indirect_edited) / np.linalg.norm(changed))
+
+
+def test_the_final_gather_reads_rows_as_the_recipe():
+    """Between whole objects to rounding; masks are cut into cells, whose error falls with their size."""
+    assert final_error(OBJECT, baked(0)) < 1e-4
+    fine = Pipeline(pipeline().snapshot, n_gather=8192)
+    field = bind(at_full_amount(BRUSH), fine.snapshot)
+    finer = bake_field(field, pipeline().view, fine.gather, fine.snapshot, where="/e", epsilon=0.005)
+    coarse = final_error(BRUSH, baked(1))
+    assert coarse < 0.2
+    # A sixteenth of the area is a quarter of the distance.
+    assert final_error(BRUSH, finer) < 0.4 * coarse
+
+
+def test_amount_stays_live():
     pipe = pipeline()
     found = baked(1)
     for amount in (0.5, 1.7):

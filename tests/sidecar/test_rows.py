@@ -84,6 +84,41 @@ def test_surfaces_are_named_relative_to_the_anchor(tmp_path: Path):
         write_payloads(tmp_path, [Payload("scale", {}, rows=rows)], anchor="/World")
 
 
+def value_by_the_book(data: dict[str, np.ndarray], row: int, leaf: int, column: int) -> float:
+    """What SPEC.md says about decoding, with plain NumPy and nothing of the package."""
+    pattern = int(np.cumsum(data["row-pattern"], dtype=int)[row])
+    ends = np.cumsum(data["pattern-size"], dtype=int)
+    begin, end = int(ends[pattern] - data["pattern-size"][pattern]), int(ends[pattern])
+    index = np.cumsum(data["index"][begin:end], dtype=int)
+    numbers = data["number"][begin:end, data["number-column"][column]] * float(data["row-step"][row, column])
+    coefficient = dict(zip(index.tolist(), numbers.tolist(), strict=True))
+    area = data["leaf-area"].astype(float)
+    value, first, last, node = coefficient.get(0, 0.0), 0, len(area), 0
+    while last - first > 1:
+        middle = first + int(data["split-size"][node])
+        a, b = area[first:middle].sum(), area[middle:last].sum()
+        difference = coefficient.get(1 + node, 0.0)
+        if leaf < middle:
+            value, last, node = value + b / (a + b) * difference, middle, node + 1
+        else:
+            value, first, node = value - a / (a + b) * difference, middle, node + middle - first
+    return value
+
+
+def test_the_specification_alone_is_enough_to_decode_rows():
+    data = dict(elements()["rows"].datasets)
+    rows = payload().rows
+    assert rows is not None
+    bound = bind_rows(rows, pipeline().snapshot, "/e")
+    assert bound.table is not None
+    rng = np.random.default_rng(5)
+    for row, leaf in zip(rng.integers(0, len(rows.row_pattern), 40), rng.integers(0, rows.n_leaves, 40), strict=True):
+        expected = [value_by_the_book(data, int(row), int(leaf), c) for c in range(3)]
+        assert np.allclose(bound.table[row, bound.cell[leaf]], expected, atol=1e-6)
+    site_row = np.cumsum(data["site-row"], dtype=int)
+    assert site_row.min() >= -1 and site_row.max() == len(data["row-pattern"]) - 1
+
+
 def test_an_object_edit_is_a_few_kilobytes(tmp_path: Path):
     file, _ = write_payloads(tmp_path, [payload("scale")], anchor="/")
     assert sum(info.stored_bytes for info in list_elements(file)) < 6000
