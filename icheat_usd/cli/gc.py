@@ -19,13 +19,20 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("roots", nargs="+", metavar="ROOT", help="folders, or layers")
     parser.add_argument("--move", action="store_true", help="move to the trash; else only say what would be moved")
     parser.add_argument("--min-age", type=float, default=24.0, metavar="HOURS", help="spare younger files; default 24")
+    parser.add_argument(
+        "--ignore",
+        action="append",
+        default=[],
+        metavar="PATTERN",
+        help="layers that may be missing or broken, as '/show/assets/*'; say so only if they name no sidecar",
+    )
     add_json(parser)
 
 
 def command(options: argparse.Namespace) -> int:
     from icheat_usd.session import housekeeping
 
-    found = housekeeping.collect(options.roots, move=options.move, min_age_hours=options.min_age)
+    found = housekeeping.collect(options.roots, move=options.move, min_age_hours=options.min_age, ignore=options.ignore)
     if options.json:
         print_json(
             {

@@ -162,7 +162,9 @@ def _beside(file: str) -> str:
 # Collecting what nobody names -----------------------------------------------------------------------------------------
 
 
-def collect(roots: Sequence[str], *, move: bool = False, min_age_hours: float = MIN_AGE_HOURS) -> Collection:
+def collect(
+    roots: Sequence[str], *, move: bool = False, min_age_hours: float = MIN_AGE_HOURS, ignore: Sequence[str] = ()
+) -> Collection:
     """Find sidecars at and below the roots that no layer names, and move them to a trash folder beside them.
 
     Every layer at, below and reachable from the roots is read, whatever of it
@@ -178,6 +180,8 @@ def collect(roots: Sequence[str], *, move: bool = False, min_age_hours: float = 
         Move; else only say what would be moved.
     min_age_hours : float
         Younger files are spared.
+    ignore : sequence of str
+        Patterns of layers that may be missing or broken, because they name no sidecar.
 
     Returns
     -------
@@ -196,7 +200,7 @@ def collect(roots: Sequence[str], *, move: bool = False, min_age_hours: float = 
         if not os.path.exists(root):
             raise StageError(f"{root} does not exist; name a layer or a folder of layers")
     layers = {os.path.realpath(layer): None for folder in folders for layer in layers_below(folder)}
-    uses = sidecar_uses(layers)
+    uses = sidecar_uses(layers, ignore=ignore)
     problems = list(uses.problems)
     unnamed: list[Unnamed] = []
     partly: list[Unnamed] = []

@@ -6,6 +6,7 @@ selected, a muted layer or an inactive prim names is named all the same.
 
 from __future__ import annotations
 
+import fnmatch
 import glob
 import os
 import re
@@ -75,12 +76,14 @@ def layers_below(root: str) -> list[str]:
     return found
 
 
-def sidecar_uses(layers: Iterable[str], *, follow: bool = True) -> SidecarUses:
+def sidecar_uses(layers: Iterable[str], *, follow: bool = True, ignore: Iterable[str] = ()) -> SidecarUses:
     """What these layers name, and, with `follow`, what the layers that they refer to name.
 
-    A layer that cannot be read is a problem in the result, not an error.
+    A layer that cannot be read is a problem in the result, not an error,
+    unless its path is like one of the patterns (as in a shell) in `ignore`.
     """
-    waiting = [os.path.realpath(layer) for layer in layers]
+    waiting = [(os.path.realpath(layer), "") for layer in layers]
+    ignored = tuple(os.path.abspath(pattern) for pattern in ignore)
     seen: dict[str, str] = {}
     files: set[str] = set()
     patterns: set[str] = set()
@@ -88,19 +91,19 @@ def sidecar_uses(layers: Iterable[str], *, follow: bool = True) -> SidecarUses:
     problems: list[str] = []
     with quiet_usd():
         while waiting:
-            identifier = waiting.pop()
+            identifier, because = waiting.pop()
             if identifier in seen:
                 continue
             seen[identifier] = _state(identifier)
-            try:
-                layer = Sdf.Layer.FindOrOpen(identifier)
-            except Tf.ErrorException:
-                layer = None
-            if not layer:
-                problems.append(f"{identifier} cannot be read as a layer")
+            layer, contents = _open(identifier)
+            if layer is None:
+                if not any(fnmatch.fnmatch(identifier, pattern) for pattern in ignored):
+                    what = "cannot be read as a layer" if seen[identifier] else "does not exist"
+                    problems.append(f"{identifier} {what}" + (f", and {because} refers to it" if because else ""))
                 continue
-            digests |= _digests(layer)
-            for path in _assets(layer):
+            for content in contents:
+                digests |= _digests(content)
+            for path in sorted(set().union(*map(_assets, contents))):
                 try:
                     places, is_pattern = _places(layer, path)
                 except EditError as problem:
@@ -112,8 +115,23 @@ def sidecar_uses(layers: Iterable[str], *, follow: bool = True) -> SidecarUses:
                     reached = [file for place in places for file in glob.glob(place)] if is_pattern else places
                     if not reached:
                         problems.append(f"{identifier}: no file is like {path}")
-                    waiting += reached
+                    waiting += [(place, identifier) for place in reached]
     return SidecarUses(seen, frozenset(files), frozenset(patterns), frozenset(digests), tuple(problems))
+
+
+def _open(identifier: str) -> tuple[Sdf.Layer | None, list[Sdf.Layer]]:
+    """A layer to resolve paths with, and what it says: in memory, where it is open already, and in its file."""
+    try:
+        known = Sdf.Layer.Find(identifier)
+        if not known:
+            opened = Sdf.Layer.FindOrOpen(identifier)
+            return (opened, [opened]) if opened else (None, [])
+        contents = [known]
+        if os.path.isfile(identifier):
+            contents.append(Sdf.Layer.OpenAsAnonymous(identifier))
+        return (known, contents) if all(contents) else (None, [])
+    except Tf.ErrorException:
+        return None, []
 
 
 def _state(file: str) -> str:

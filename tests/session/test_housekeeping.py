@@ -167,8 +167,21 @@ def test_gc_moves_nothing_when_a_layer_cannot_be_read(shot: Path, capsys: pytest
         assert run(["gc", str(shot.parent), "--move"]) == FINDINGS, name
         assert "problem:" in capsys.readouterr().out
         assert (shot.parent / "shot.v001.icheat.h5").exists()
+        ignore = "--ignore=" + str(shot.parent / ("gone.*" if name == "reaching.usda" else "broken.*"))
+        expected = FINDINGS if name == "unsure.usda" else CLEAN
+        assert run(["gc", str(shot.parent), ignore]) == expected
         (shot.parent / name).unlink()
     assert run(["gc", str(shot.parent / "nowhere")]) == FAILURE
+
+
+def test_gc_reads_the_file_of_a_layer_that_is_open_in_another_state(shot: Path) -> None:
+    held = Sdf.Layer.FindOrOpen(str(shot))
+    _age(shot.parent)
+    assert _names(shot) == {"shot.v002.icheat.h5"}
+    # Someone else goes back to the first version; this process still has the layer as it was.
+    shot.write_text(shot.read_text().replace("shot.v002", "shot.v001"))
+    assert "shot.v002" in held.ExportToString()
+    assert not housekeeping.collect([str(shot)], move=True).unnamed
 
 
 def test_gc_spares_what_is_published_young_linked_or_no_sidecar(shot: Path) -> None:
