@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from icheat_usd.session.document import Session
     from icheat_usd.session.explain import contribution_film, explain_pixel
     from icheat_usd.session.inspection import check
+    from icheat_usd.session.keys import copy_key, list_keys, remove_key, set_key
+    from icheat_usd.session.publishing import publish
     from icheat_usd.session.quality import DRAFT, Quality
 
 __all__ = [
@@ -33,12 +35,17 @@ __all__ = [
     "check",
     "compare_stages",
     "contribution_film",
+    "copy_key",
     "create_stack",
     "explain_pixel",
+    "list_keys",
     "move_edit",
     "mute_edit",
+    "publish",
     "remove_edit",
+    "remove_key",
     "set_edit",
+    "set_key",
     "soft_sphere",
 ]
 
@@ -46,7 +53,12 @@ _HOMES = {
     "check": "icheat_usd.session.inspection",
     "compare_stages": "icheat_usd.session.differences",
     "contribution_film": "icheat_usd.session.explain",
+    "copy_key": "icheat_usd.session.keys",
     "explain_pixel": "icheat_usd.session.explain",
+    "list_keys": "icheat_usd.session.keys",
+    "publish": "icheat_usd.session.publishing",
+    "remove_key": "icheat_usd.session.keys",
+    "set_key": "icheat_usd.session.keys",
     "soft_sphere": "icheat_usd.edits.painting",
     "GatherSettings": "icheat_usd.final_gather",
     "Session": "icheat_usd.session.document",

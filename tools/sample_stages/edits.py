@@ -8,6 +8,7 @@ from pathlib import Path
 
 from icheat_usd.edits import operations
 from icheat_usd.edits.model import Payload, SurfaceMask, Value
+from icheat_usd.edits.operations.constants import baked_constants
 from icheat_usd.edits.painting import paint_mask, soft_sphere
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.session.authoring import surfaces_below
@@ -127,19 +128,8 @@ def _payload(stage: object, snapshot: SceneSnapshot, edit: New, parameters: Mapp
         parameters=dict(parameters),
         receiver_mask=_mask(stage, snapshot, edit.receivers, edit.receiver_sphere),
         caster_mask=_mask(stage, snapshot, edit.casters, edit.caster_sphere),
-        scale_delta=_delta(operation, parameters, edit.name),
-        made_against={"camera": "/World/Cameras/Main"},
+        **baked_constants(operation, operation.complete(parameters, edit.name)),
     )
-
-
-def _delta(
-    operation: operations.Operation, parameters: Mapping[str, Value], where: str
-) -> tuple[float, float, float] | None:
-    constants = operation.constants(operation.complete(parameters, where))
-    if constants is None:
-        return None
-    red, green, blue = (float(factor) - 1 for factor in constants.scale[0])
-    return red, green, blue
 
 
 def _mask(stage: object, snapshot: SceneSnapshot, members: Sequence[str], sphere: Sphere | None) -> SurfaceMask | None:

@@ -27,7 +27,7 @@ class Shown:
 SHOWN = (
     Shown(
         "cornell_box",
-        "-6.3",
+        "+21.3",
         New(
             "scale",
             "Scale: the red wall sends floor, back wall and blocks five times its light; the ceiling gets what it got.",
@@ -38,7 +38,7 @@ SHOWN = (
     ),
     Shown(
         "glossy_set",
-        "+0.0",
+        "+4.6",
         New(
             "hsv",
             "Hue, saturation, value: what the blue wall sends the things is turned to orange, on the diffuse box as "
@@ -51,7 +51,7 @@ SHOWN = (
     ),
     Shown(
         "furnished_room",
-        "+0.0",
+        "+3.8",
         New(
             "redirect",
             "Redirect: sunlit rug, table and floor send their light towards the person, at the room's expense.",
@@ -64,7 +64,7 @@ SHOWN = (
     ),
     Shown(
         "staircase",
-        "+0.0",
+        "-0.1",
         New(
             "gamma",
             "Gamma: more contrast in what the ceiling sends stairs and statue.",
@@ -76,7 +76,7 @@ SHOWN = (
     ),
     Shown(
         "furnished_room",
-        "+0.0",
+        "+7.3",
         New(
             "curve",
             "Curve: an S-curve on all the light that the room sends walls and ceiling; shadows sink, lights stay.",
@@ -88,7 +88,7 @@ SHOWN = (
     ),
     Shown(
         "glossy_set",
-        "+0.0",
+        "+31.2",
         New(
             "falloff",
             "Falloff: the blue wall's light falls with the first power of distance from a pivot of 0.4 m, so that it "
@@ -101,7 +101,7 @@ SHOWN = (
     ),
     Shown(
         "furnished_room",
-        "+0.0",
+        "+0.7",
         New(
             "direction",
             "Direction: the person is lit from the window's side, and less from everywhere else.",
@@ -113,7 +113,7 @@ SHOWN = (
     ),
     Shown(
         "staircase",
-        "+0.0",
+        "+2.8",
         New(
             "unshadow",
             "Remove shadow: the ceiling's light reaches stairs and statue as if the cylinder were not there.",
@@ -125,20 +125,20 @@ SHOWN = (
     ),
     Shown(
         "glossy_set",
-        "+0.0",
+        "+10.6",
         New(
             "paint",
             "Paint: the box's colour bleeds onto the floor in a painted patch.",
             receivers=("Geometry/Set/Floor",),
             casters=("Geometry/Things/Box",),
             operation="paint",
-            parameters={"color": (3.0, 3.0, 3.0)},
+            parameters={"color": (1.5, 1.5, 1.5)},
             receiver_sphere=(1.0, 0.0, 0.35, 0.1, 1.0),
         ),
     ),
     Shown(
         "staircase",
-        "+0.0",
+        "+3.9",
         New(
             "emit",
             "Emit: the cylinder sends red light to stairs and statue, and to nothing else.",
@@ -150,7 +150,7 @@ SHOWN = (
     ),
     Shown(
         "cornell_box",
-        "+0.0",
+        "+12.3",
         New(
             "albedo",
             "Albedo: the green wall is seen green, but all it sends on is as if it were golden.",
@@ -162,7 +162,7 @@ SHOWN = (
     ),
     Shown(
         "cornell_box",
-        "+0.0",
+        "+7.0",
         New(
             "receive",
             "Receive: all indirect light on the blocks, whoever sent it, warmer and lifted.",
@@ -174,7 +174,7 @@ SHOWN = (
     ),
     Shown(
         "furnished_room",
-        "+0.0",
+        "+43.6",
         New(
             "one_light",
             "One light's share: what the sun's light does after it first met a surface, tinted and doubled; the sky's "
@@ -187,7 +187,7 @@ SHOWN = (
     ),
     Shown(
         "cornell_box",
-        "+0.0",
+        "+12.9",
         New(
             "region",
             "A region: within a soft sphere, whatever surfaces it meets, the green wall's light is six times as much.",
