@@ -40,7 +40,10 @@ def _masks(draw: st.DrawFn) -> SurfaceMask:
     shape = (sum(surface.n_faces for surface in surfaces), resolution, resolution)
     eighths = st.integers(0, 255).map(lambda k: np.float32(k) / np.float32(255))
     weights = draw(st.sampled_from([st.floats(0, 1, width=32), eighths]))
-    return SurfaceMask(surfaces, draw(npst.arrays(np.float32, shape, elements=weights)))
+    finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
+    positions = draw(st.sampled_from([finite, st.floats(999, 1001, width=32), st.just(0.0)]))
+    rest = draw(st.none() | npst.arrays(np.float32, (shape[0], 2, 2, 3), elements=positions))
+    return SurfaceMask(surfaces, draw(npst.arrays(np.float32, shape, elements=weights)), rest)
 
 
 _payloads = st.builds(
@@ -50,9 +53,11 @@ _payloads = st.builds(
     receiver_mask=st.none() | _masks(),
     caster_mask=st.none() | _masks(),
     scale_delta=st.none() | st.tuples(_number, _number, _number),
+    emission=st.none() | st.tuples(_number, _number, _number),
+    offset=st.none() | st.tuples(_number, _number, _number),
     made_against=st.dictionaries(_name, _number | _text | st.integers(-(2**63), 2**63 - 1), max_size=3),
     unknown=st.dictionaries(
-        st.sampled_from(["rows", "ünknown", "z-later"]),
+        st.sampled_from(["later-rows", "ünknown", "z-later"]),
         st.builds(
             Element,
             type=_name,
@@ -72,8 +77,23 @@ _payloads = st.builds(
 )
 
 
+def assert_rest_within_the_stated_error(mine: SurfaceMask, other: SurfaceMask) -> None:
+    assert (mine.rest is None) == (other.rest is None)
+    if mine.rest is None or other.rest is None:
+        return
+    begin = 0
+    for surface in mine.surfaces:
+        one, two = (rest[begin : begin + surface.n_faces].astype(np.float64) for rest in (mine.rest, other.rest))
+        if one.size:
+            size = one.max((0, 1, 2)) - one.min((0, 1, 2))
+            rounding = np.abs(one).max() * 2.0**-23 + 1e-44
+            assert (np.abs(one - two) <= size / 131070 * (1 + 1e-9) + rounding).all()
+        begin += surface.n_faces
+
+
 def assert_same(a: Payload, b: Payload) -> None:
     assert (a.operation, dict(a.parameters), a.scale_delta) == (b.operation, dict(b.parameters), b.scale_delta)
+    assert (a.emission, a.offset) == (b.emission, b.offset)
     assert dict(a.made_against) == dict(b.made_against)
     assert {k: type(v) for k, v in a.made_against.items()} == {k: type(v) for k, v in b.made_against.items()}
     for mine, other in ((a.receiver_mask, b.receiver_mask), (a.caster_mask, b.caster_mask)):
@@ -82,6 +102,7 @@ def assert_same(a: Payload, b: Payload) -> None:
             assert mine.surfaces == other.surfaces
             assert other.texels.dtype == np.float32 and other.texels.flags.c_contiguous and other.texels.flags.writeable
             np.testing.assert_array_equal(mine.texels, other.texels)
+            assert_rest_within_the_stated_error(mine, other)
     assert set(a.unknown) == set(b.unknown)
     for name, element in a.unknown.items():
         assert (element.type, element.version) == (b.unknown[name].type, b.unknown[name].version)
