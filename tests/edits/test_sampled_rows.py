@@ -381,6 +381,22 @@ def test_rows_ride_with_their_surfaces(how):
     assert np.abs(after - before).max() < (0.03 if how == "floor bends" else 2e-3)
 
 
+def test_the_unit_of_object_space_does_not_matter():
+    """A floor modelled in micrometres and scaled down where it is placed."""
+
+    def tiny(mesh: Mesh) -> Mesh:
+        own = np.eye(4)
+        own[: len(mesh.transforms[0])] = np.asarray(mesh.transforms[0], float)
+        return replace(mesh, points=np.asarray(mesh.points) * 1e6, transforms=[own @ np.diag([1e-6, 1e-6, 1e-6, 1])])
+
+    snapshot = cornell_with(tiny)
+    pipe = Pipeline(snapshot, n_gather=256)
+    field = bind(at_full_amount(BRUSH), snapshot)
+    found = bake_field(field, pipe.view, pipe.gather, snapshot, where="/e")
+    assert np.isfinite(found.rows.site_reach).all() and found.rows.site_reach.max() > 1e4
+    assert found.rows.epsilon_scale <= 0.0101 and found.measured <= 0.021
+
+
 def test_a_surface_that_is_gone_is_the_identity_and_a_finding():
     pipe = pipeline()
     kept = [mesh for mesh in cornell_meshes() if mesh.path != "/floor"]

@@ -90,7 +90,7 @@ def assemble(
         side=sides.side.astype(np.uint8),
         side_leaves=new_begin[sides.leaves].astype(np.int32),
         sites=places.take(order),
-        site_reach=(sites.reach / np.where(scale > 0, scale, 1))[order].astype(np.float16).astype(np.float32),
+        site_reach=_short((sites.reach / np.where(scale > 0, scale, 1))[order].astype(np.float32)),
         site_row=site_row,
         row_pattern=row_pattern,
         row_step=row_step,
@@ -133,6 +133,12 @@ def _renumbered(site_row: I32, row_pattern: I32, row_step: F32) -> tuple[I32, I3
     number = np.full(len(row_pattern) + 1, -1, np.int32)
     number[order] = np.arange(len(order))
     return number[site_row], row_pattern[order], row_step[order]
+
+
+def _short(values: F32) -> F32:
+    """Rounded to 11 binary digits, so that they take few bytes in a file."""
+    bits = (np.ascontiguousarray(values).view(np.uint32) + np.uint32(1 << 12)) & np.uint32(0xFFFFE000)
+    return bits.view(np.float32)
 
 
 def _bounds(n: int, parts: list[tuple[I32, F32]]) -> F32:
