@@ -97,7 +97,7 @@ def pack(
     wanted: set[str] | None = set()
     for name in inputs:
         if name.lower().endswith(LAYER_SUFFIXES):
-            uses = _uses_of_layer(name)
+            uses = uses_of_layer(name)
             sources.update(dict.fromkeys(sorted(uses.files)))
             wanted = wanted if wanted is None else wanted | uses.digests
         else:
@@ -114,13 +114,15 @@ def pack(
     if layer is not None:
         try:
             repointed[layer] = repoint_layer(layer, str(file), sources)
-        except BaseException:
+        except Exception:
+            # Not after an interruption: the layer may have been saved already, and then names the file.
             file.unlink(missing_ok=True)
             raise
     return Packed(str(file), tuple(payloads), tuple(sources), repointed)
 
 
-def _uses_of_layer(name: str) -> SidecarUses:
+def uses_of_layer(name: str) -> SidecarUses:
+    """What one layer names. Raises `StageError` or `EditError` where that cannot be told for certain."""
     if not os.path.isfile(name):
         raise StageError(f"{name} does not exist; name a layer or a sidecar file")
     uses = sidecar_uses([name], follow=False)

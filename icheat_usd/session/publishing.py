@@ -68,16 +68,22 @@ def publish(stage: Any, out: str | None = None, *, layers: Sequence[str] = (), w
     if out is None and not root:
         raise EditError("the stage has no file to publish beside; name the file with --out")
     beside = out or str(Path(root).with_suffix(".published.usda"))
-    files = list(dict.fromkeys(key.file for key in keys))
+    files = dict.fromkeys(key.file for key in keys)
     wanted = {key.digest for key in keys}
+    for layer in layers:
+        # Also what variants that are not selected name: after repointing it must be in the file.
+        uses = housekeeping.uses_of_layer(layer)
+        files |= dict.fromkeys(sorted(uses.files))
+        wanted |= uses.digests
     entry = history_entry(why or "published")
-    file, payloads = sidecar.pack(files, beside, only=wanted, history=entry, published=True)
+    file, payloads = sidecar.pack([*files], beside, only=wanted, history=entry, published=True)
     repointed: dict[str, int] = {}
     try:
         manifest = housekeeping.write_manifest(str(file), _manifest(stage, str(file), keys, payloads, entry))
         for layer in layers:
             repointed[layer] = repoint_layer(layer, str(file), files)
-    except BaseException:
+    except Exception:
+        # Not after an interruption: a layer may have been saved already, and then names the file.
         if not any(repointed.values()):
             file.unlink(missing_ok=True)
             Path(housekeeping.manifest_path(str(file))).unlink(missing_ok=True)

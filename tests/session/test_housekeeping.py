@@ -330,6 +330,29 @@ def test_publish_verifies_packs_and_pins(shot: Path, capsys: pytest.CaptureFixtu
     assert not inspection.check(inspection.open_stage(shot))
 
 
+def test_publish_takes_along_what_a_variant_of_a_repointed_layer_names(shot: Path) -> None:
+    file, (digest,) = write_payloads(shot, [Payload("scale", {"gain": 9.0})], anchor="/World")
+    shot.write_text(
+        shot.read_text()
+        + f"""
+over "Other" (
+    prepend variantSets = "grade"
+)
+{{
+    variantSet "grade" = {{
+        "dusk" {{
+            asset icheat:filePath = @./{file.name}@
+            token icheat:payload = "{digest}"
+        }}
+    }}
+}}
+"""
+    )
+    published = publishing.publish(inspection.open_stage(shot), layers=[str(shot)])
+    assert digest in published.payloads and len(published.payloads) == 2
+    assert _names(shot) == {"shot.published.v001.icheat.h5"} and published.repointed == {str(shot): 2}
+
+
 @pytest.mark.parametrize("how", ["missing", "damaged", "other"])
 def test_publish_refuses_what_is_missing_or_damaged_even_in_a_muted_edit(
     how: str, shot: Path, capsys: pytest.CaptureFixture[str]
