@@ -14,14 +14,20 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.edits.field import Aggregate, EditField, Ends
-from icheat_usd.scene import F32, F64, I64
+from icheat_usd.edits.operations import Level, Operation
+from icheat_usd.scene import F32, F64, I64, Bool
 
 #: Pairs of receivers and gather samples evaluated at once.
 PAIRS_AT_ONCE = 1 << 17
 
+#: Where every receiver has offsets of its own, more casters than this are gathered into patches.
+MOST_CASTERS = 1024
+#: Receivers with different masks that are still worth a sum over all casters each.
+MOST_SUMS = 16
+
 
 class OffsetCasters(NamedTuple):
-    """The gather samples that edits may take offsets from."""
+    """The gather samples that edits may take offsets from, neighbours next to each other."""
 
     ends: Ends
     b: F32  #: (G, n, 3) radiance that leaves them, by group of lights
@@ -33,13 +39,37 @@ def offset_casters(field: EditField, casters: Ends, b: F32, area: F32) -> Offset
     if not field.has_offset:
         return None
     rows: list[int] = []
-    row = 0
-    for bound in field.edits:
+    for edit, bound in enumerate(field.edits):
         if bound.operation is None or bound.operation.has_offset:
-            rows += range(row, row + bound.n_keys)
-        row += bound.n_keys
+            rows += range(*field.rows_of(edit).indices(field.n_rows))
     which = np.flatnonzero((casters.masks[rows] > 0).any(axis=0))
     return OffsetCasters(casters.take(which), np.take(b, which, axis=1), area[which]) if len(which) else None
+
+
+def patches(casters: OffsetCasters) -> OffsetCasters:
+    """About `MOST_CASTERS` casters that stand for all: each for some neighbours of its own masks, with all their light.
+
+    Exact but for what edits and soft masks change within a patch.
+    """
+    n = len(casters.area)
+    if n <= MOST_CASTERS:
+        return casters
+    inside = casters.ends.masks > 0
+    breaks = np.ones(n, np.bool_)
+    breaks[1:] = (inside[:, 1:] != inside[:, :-1]).any(axis=0)
+    breaks[:: -(-n // MOST_CASTERS)] = True
+    begin = np.flatnonzero(breaks)
+    end = np.append(begin[1:], n)
+    area = np.add.reduceat(casters.area, begin).astype(np.float32)
+    light = np.add.reduceat(casters.area[:, None] * casters.b, begin, axis=1)
+    whole = np.maximum(area, np.float32(1e-30))[:, None]
+    ends = casters.ends.take((begin + end - 1) // 2)
+    masks = np.add.reduceat(casters.area * casters.ends.masks, begin, axis=1) / whole[:, 0]
+    ends = ends._replace(masks=masks.astype(np.float32))
+    if casters.ends.place is not None and ends.place is not None:
+        position = np.add.reduceat(casters.area[:, None] * casters.ends.place.position, begin, axis=0) / whole
+        ends = ends._replace(place=ends.place._replace(position=position.astype(np.float32)))
+    return OffsetCasters(ends, (light / whole).astype(np.float32), area)
 
 
 def offset_radiance(
@@ -65,22 +95,46 @@ def offset_radiance(
     -------
     (n, 3) float32, radiance, scene-linear
     """
-    n = receivers.masks.shape[1]
-    result = np.zeros((n, 3), np.float32)
-    if resolved or field.uses_receiver:
-        at_once = max(1, PAIRS_AT_ONCE // len(casters.area))
-        for begin in range(0, n, at_once):
-            which = np.arange(begin, min(begin + at_once, n))
-            diffuse, paint = offset_sums(field, casters, receivers, which, resolved, upto, aggregate)
-            result[which] = albedo[which] * diffuse.astype(np.float32) + paint.astype(np.float32)
-        return result
-    _, first, inverse = np.unique(receivers.masks, axis=1, return_index=True, return_inverse=True)
-    inverse = inverse.reshape(-1)
-    for k, one in enumerate(first):
-        diffuse, paint = offset_sums(field, casters, receivers, np.array([one]), resolved, upto, aggregate)
-        same = np.flatnonzero(inverse == k)
-        result[same] = albedo[same] * diffuse.astype(np.float32) + paint.astype(np.float32)
+    result = np.zeros((receivers.masks.shape[1], 3), np.float32)
+
+    def add(source: OffsetCasters, one: I64, to: I64) -> None:
+        diffuse, paint = offset_sums(field, source, receivers, one, resolved, upto, aggregate)
+        result[to] = albedo[to] * diffuse.astype(np.float32) + paint.astype(np.float32)
+
+    alone = _have_their_own(field, receivers)
+    shared = np.flatnonzero(~alone)
+    if len(shared):
+        _, first, inverse = np.unique(receivers.masks[:, shared], axis=1, return_index=True, return_inverse=True)
+        if len(first) <= MOST_SUMS:
+            for k, one in enumerate(shared[first]):
+                add(casters, np.array([one]), shared[inverse.reshape(-1) == k])
+        else:
+            alone[shared] = True
+    rest = np.flatnonzero(alone)
+    if len(rest):
+        few = patches(casters)
+        at_once = max(1, PAIRS_AT_ONCE // len(few.area))
+        for begin in range(0, len(rest), at_once):
+            some = rest[begin : begin + at_once]
+            add(few, some, some)
     return result
+
+
+def _have_their_own(field: EditField, receivers: Ends) -> Bool:
+    """Receivers whose offsets depend on more than their masks: an edit that looks at them lies over an offset."""
+    found = np.zeros(receivers.masks.shape[1], np.bool_)
+    offset_below = any(bound.operation is not None and _offset_looks_at_light(bound.operation) for bound in field.edits)
+    for edit, bound in enumerate(field.edits):
+        operation = bound.operation
+        offset_below |= operation is None or operation.has_offset
+        looks = any(rows is not None for rows in bound.rows) if operation is None else operation.uses_receiver
+        if offset_below and (looks or bound.level is Level.AGGREGATE):
+            found |= (receivers.masks[field.rows_of(edit)] > 0).any(axis=0)
+    return found
+
+
+def _offset_looks_at_light(operation: Operation) -> bool:
+    return operation.has_offset and operation.uses_incident
 
 
 def offset_sums(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icheat_usd.edits import operations, reference
+from icheat_usd.edits import offsets, operations, reference
 from icheat_usd.edits.encodings.bake import bake_field
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend, Edit, KeyedPayload, MaskedSurface, Payload, SurfaceMask
@@ -201,3 +201,18 @@ def test_baked_rows_equal_the_slow_evaluator(n_keys, monkeypatch):
     warm = edit("warm", "scale", select("/floor"), select("/red", "/back"))
     curve = edit("curve", "gamma", select("/floor"))
     assert_equals_the_slow_evaluator("full", (warm, rows, curve), monkeypatch)
+
+
+def test_patches_of_casters_stand_for_all_of_them(monkeypatch):
+    """Where each receiver has offsets of its own: exact where the edits are the same within a patch."""
+    parts = Pipeline(room(8), n_gather=3000, rays=32, bounce_rays=32, light_samples=4, n_bounces=2)
+    paint = edit("paint", "paint", select("/floor", "/back"), select("/red", "/ceiling"))
+    for over, tolerance in (("gamma", 1e-4), ("falloff", 5e-3)):
+        field = parts.field(paint, edit("over", over, select("/floor", "/back"), select("/red", "/green", "/ceiling")))
+        found = []
+        for most in (200, 10_000):
+            monkeypatch.setattr(offsets, "MOST_CASTERS", most)
+            light = parts.relighter.relight(field)
+            found.append(light.indirect_edited - light.indirect)
+        assert np.abs(found[1]).max() > 0.02
+        np.testing.assert_allclose(found[0], found[1], atol=tolerance * np.abs(found[1]).max())
