@@ -59,7 +59,7 @@ def decode_payload(elements: Mapping[str, Element], *, anchor: str, where: str) 
                 "restore the file from a copy"
             ) from problem
         except SidecarError as problem:
-            raise SidecarError(f"{where}: element '{name}': {shown(str(problem), 400)}") from problem
+            raise SidecarError(f"{where}: element '{name}': {_brief(problem)}") from problem
     if "operation" not in values:
         raise SidecarError(f"{where}: the payload has no element 'recipe'; restore the file from a copy")
     operation, parameters = values.pop("operation")
@@ -82,3 +82,9 @@ def encode_payload(payload: Payload, *, anchor: str) -> dict[str, Element]:
             raise SidecarError(f"unknown element '{name}' is not one that a sidecar reader kept; leave it out")
         elements[name] = element
     return elements
+
+
+def _brief(problem: SidecarError) -> str:
+    """A message of one line, of a length that one reads, with its next step."""
+    text = shown(str(problem), 400)
+    return text if len(str(problem)) <= 400 else f"{text[:300]} ...; restore the file from a copy"

@@ -99,7 +99,7 @@ def read_elements(
             )
         payload = child_group(payloads, digest, where)
         elements: dict[str, Element] = {}
-        budget, count = [limit_bytes], [0]
+        budget, count, seen = [limit_bytes], [0], set[int]()
         for name in link_names(payload, where):
             place = f"{where}: payload {digest[:12]}: element '{shown(name)}'"
             group = child_group(payload, name, f"{where}: payload {digest[:12]}")
@@ -107,10 +107,11 @@ def read_elements(
             if refuse_newer:
                 # Before the values: those of a newer element may look like damage.
                 check_known(name, type_, version, f"{where}: payload {digest[:12]}")
-            datasets = {
-                path: read_dataset(dataset, f"{place}: '{shown(path)}'", budget)
-                for path, dataset in datasets_below(group, place, count)
-            }
+            check_first_sight(group, seen, place)
+            datasets: dict[str, Array] = {}
+            for path, dataset in datasets_below(group, place, count):
+                check_first_sight(dataset, seen, place)
+                datasets[path] = read_dataset(dataset, f"{place}: '{shown(path)}'", budget)
             elements[name] = Element(type_, version, datasets)
         try:
             found = digest_of(elements)
@@ -219,6 +220,14 @@ def datasets_below(
             yield from datasets_below(child, where, count, f"{prefix}{name}/")
         else:
             raise SidecarError(f"{where}: '{shown(prefix + name)}' is neither group nor dataset; {_RESTORE}")
+
+
+def check_first_sight(thing: h5py.Group | h5py.Dataset, seen: set[int], where: str) -> None:
+    """Refuse an object that has been seen under another name: a small file could list one as billions."""
+    address = int(h5py.h5o.get_info(thing.id).addr)
+    if address in seen:
+        raise SidecarError(f"{where}: '{shown(str(thing.name))}' has more than one name; {_RESTORE}")
+    seen.add(address)
 
 
 def element_mark(group: h5py.Group, where: str) -> tuple[str, int]:

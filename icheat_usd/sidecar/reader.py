@@ -14,6 +14,7 @@ from icheat_usd.sidecar.guarded import (
     Source,
     aliases_of,
     attribute,
+    check_first_sight,
     child_group,
     datasets_below,
     element_mark,
@@ -26,6 +27,9 @@ from icheat_usd.sidecar.guarded import (
     read_elements,
 )
 from icheat_usd.sidecar.values import shown
+
+#: History beyond this is refused.
+_MAX_HISTORY_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -114,14 +118,18 @@ def list_elements(file: Source, *, name: str | None = None) -> tuple[ElementInfo
     """Every dataset in a file, sorted, without reading their values. Raises `SidecarError` as `read_payload`."""
     where = file_name(file, name)
     infos: list[ElementInfo] = []
+    seen: set[int] = set()
     with open_sidecar(file, where) as root, naming_damage(where):
         payloads = child_group(root, "payloads", where)
         for digest in payload_names(root, where):
             payload = child_group(payloads, digest, where)
+            check_first_sight(payload, seen, where)
             for element in link_names(payload, where):
                 group = child_group(payload, element, f"{where}: {digest[:12]}")
+                check_first_sight(group, seen, where)
                 type_, version = element_mark(group, f"{where}: {digest[:12]}: element '{shown(element)}'")
                 for path, dataset in datasets_below(group, f"{where}: {digest[:12]}: element '{shown(element)}'", [0]):
+                    check_first_sight(dataset, seen, where)
                     raw = math.prod(dataset.shape) * dataset.dtype.itemsize
                     stored = int(dataset.id.get_storage_size())
                     kind = kind_of(dataset.dtype) or str(dataset.dtype)
@@ -139,10 +147,13 @@ def read_history(file: Source, *, name: str | None = None) -> tuple[History, ...
         if not root.id.links.exists(b"history"):
             return ()
         history = child_group(root, "history", where)
+        # For all entries together: hard links can make one of them many.
+        budget, count = [_MAX_HISTORY_BYTES], [0]
         for number in link_names(history, where):
             texts: dict[str, list[str]] = {}
-            budget = [1 << 24]
-            for path, dataset in datasets_below(child_group(history, number, where), f"{where}: history {number}", [0]):
+            for path, dataset in datasets_below(
+                child_group(history, number, where), f"{where}: history {number}", count
+            ):
                 values = read_dataset(dataset, f"{where}: history {number}: '{path}'", budget)
                 if values.dtype.kind == "S":
                     texts[path] = [item.decode("utf-8", "replace") for item in values.reshape(-1).tolist()]

@@ -17,7 +17,7 @@ import pytest
 
 from icheat_usd.edits.model import Payload
 from icheat_usd.errors import SidecarError
-from icheat_usd.sidecar import Element, describe, list_elements, list_payloads, pack, read_payload, writer
+from icheat_usd.sidecar import Element, describe, list_elements, list_payloads, pack, read_history, read_payload, writer
 from icheat_usd.sidecar.canonical import digest_of
 from icheat_usd.sidecar.elements import encode_payload
 
@@ -150,9 +150,42 @@ def test_rings_of_hard_links_end(tampered: Tamper) -> None:
             group[name] = group
 
     path = tampered(ring)
-    _refused(path, "objects or 8 levels")
-    with pytest.raises(SidecarError, match="objects or 8 levels"):
+    _refused(path, "objects or 8 levels|more than one name")
+    with pytest.raises(SidecarError, match="objects or 8 levels|more than one name"):
         list_elements(path)
+
+
+def test_one_object_is_not_listed_under_many_names(tampered: Tamper) -> None:
+    """A file of some megabytes could name one dataset 10^14 times."""
+
+    def multiply(file: h5py.File) -> None:
+        payloads = file["payloads"]
+        for number in range(300):
+            payloads[f"{number:064x}"] = payloads[SCALE]
+            payloads[SCALE][f"element{number}"] = payloads[SCALE]["recipe"]
+            payloads[SCALE]["recipe"][f"dataset{number}"] = payloads[SCALE]["recipe/operation"]
+
+    path = tampered(multiply)
+    for look in (list_elements, describe):
+        with pytest.raises(SidecarError, match="more than one name"):
+            look(path)
+    _refused(path, "more than one name")
+
+
+def test_history_is_bounded_as_a_whole(tampered: Tamper) -> None:
+    def multiply(file: h5py.File) -> None:
+        entry = file["history/000000"]
+        _replace(file, "history/000000/why", data=np.array(b"x" * (1 << 20)))
+        for number in range(1, 400):
+            file["history"][f"{number:06d}"] = entry
+
+    path = tampered(multiply)
+    tracemalloc.start()
+    with pytest.raises(SidecarError, match="more than the .* left of the limit"):
+        read_history(path)
+    assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    tracemalloc.stop()
+    assert read_payload(path, SCALE, anchor="/World").operation == "scale"
 
 
 def test_values_in_other_files_are_not_read(tampered: Tamper, tmp_path: Path) -> None:
