@@ -194,6 +194,7 @@ def mixtures(  # type: ignore[no-untyped-def]
         near = np.empty(NEIGHBOURS + 1, np.int64)
         distance = np.empty(NEIGHBOURS + 1, np.float64)
         share = np.empty(NEIGHBOURS, np.float64)
+        mixed = np.empty(NEIGHBOURS, np.float64)
         for q in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
             out_confidence[q] = 0.0
             out_nearest[q, 0] = -1.0
@@ -238,6 +239,21 @@ def mixtures(  # type: ignore[no-untyped-def]
             fade = min(max(2.0 - distance[0] / mean_reach, 0.0), 1.0)
             fade = fade * fade * (3.0 - 2.0 * fade) * min(2.0 * agreeing / total, 1.0)
             out_confidence[q] = fade
+            # Neighbours of one row count as one, the identity as none: then places with the same mixture look the same.
+            n_rows = 0
             for s in range(used):
-                out_row[q, s] = row[near[s]]
-                out_weight[q, s] = fade * share[s] / agreeing
+                here = row[near[s]]
+                if here < 0 or share[s] == 0.0:
+                    continue
+                slot = 0
+                while slot < n_rows and out_row[q, slot] != here:
+                    slot += 1
+                if slot == n_rows:
+                    out_row[q, slot] = here
+                    mixed[slot] = 0.0
+                    n_rows += 1
+                mixed[slot] += share[s]
+            for slot in range(n_rows):
+                # Rounding of sums must not tell places apart.
+                part = mixed[slot] / agreeing
+                out_weight[q, slot] = fade * (1.0 if part > 1.0 - 1e-6 else part)

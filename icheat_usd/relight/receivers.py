@@ -64,7 +64,9 @@ def group_receivers(field: EditField, view: ViewSamples) -> Receivers:
     n_aggregates = touches[aggregate].sum(axis=0)
     reached: Bool = np.asarray(touches.any(axis=0), np.bool_)
     left: Bool = reached & ~touches[alone].any(axis=0)
-    groups = [ReceiverGroup(where) for where in _alike(masks, np.flatnonzero(left & (n_aggregates == 0)))]
+    mixtures = _mixtures(ends)
+    known = np.concatenate([masks, mixtures])
+    groups = [ReceiverGroup(where) for where in _alike(known, np.flatnonzero(left & (n_aggregates == 0)))]
     for group in groups:
         left[group.where] = False
 
@@ -72,7 +74,8 @@ def group_receivers(field: EditField, view: ViewSamples) -> Receivers:
     linear = np.array([_is_linear(bound) for bound in field.edits], np.bool_)
     left &= linear[strongest] & (n_aggregates == aggregate[strongest])
     flags = np.where(row_edit[:, None] == strongest, masks > 0, masks)
-    groups += [ReceiverGroup(where, int(strongest[where[0]])) for where in _alike(flags, np.flatnonzero(left))]
+    known = np.concatenate([flags, mixtures])
+    groups += [ReceiverGroup(where, int(strongest[where[0]])) for where in _alike(known, np.flatnonzero(left))]
 
     single: Bool = reached.copy()
     for group in groups:
@@ -91,11 +94,15 @@ def _alike(masks: F32, which: I64) -> Iterator[I64]:
         yield which[order[ends[k] - counts[k] : ends[k]]]
 
 
+def _mixtures(ends: Ends) -> F32:
+    """Rows, and their weights, that hold at the samples, of every edit that is baked as rows: (n_columns, n)."""
+    columns = [np.asarray(column, np.float32).T for entry in ends.located for column in (entry.rows, entry.weights)]
+    return np.concatenate([np.zeros((0, ends.masks.shape[1]), np.float32), *columns])
+
+
 def _looks_at_receiver(bound: BoundEdit) -> bool:
-    """Whether receivers of the same masks differ under the edit."""
-    if bound.operation is None:
-        return any(rows is not None for rows in bound.rows)
-    return bound.operation.uses_receiver
+    """Whether receivers of the same masks, and of the same sampled rows, differ under the edit."""
+    return bound.operation is not None and bound.operation.uses_receiver
 
 
 def _is_linear(bound: BoundEdit) -> bool:
