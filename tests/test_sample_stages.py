@@ -130,7 +130,7 @@ def test_an_operation_changes_the_light_as_its_documentation_states(name: str) -
         STAGES / "operations" / f"{name}.usda",
         width=80,
         height=60,
-        quality=Quality(n_gather=8192, rays_per_row=64, rays_per_bounce_row=64, light_samples=8),
+        quality=Quality(n_gather=16_384, rays_per_row=128, rays_per_bounce_row=64, light_samples=8),
     )
     layers = session.relight().layers
     change = 100 * luminance(layers["edit_delta"]) / luminance(layers["indirect"])

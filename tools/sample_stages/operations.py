@@ -51,27 +51,27 @@ SHOWN = (
     ),
     Shown(
         "furnished_room",
-        "+3.8",
+        "+6.6",
         New(
             "redirect",
             "Redirect: sunlit rug, table and floor send their light towards the person, at the room's expense.",
-            receivers=("Geometry",),
+            receivers=("Geometry/Person", "Geometry/Sofa", "Geometry/Room/BackWall", "Geometry/Room/Ceiling"),
             casters=("Geometry/Rug", "Geometry/CoffeeTable", "Geometry/Room/Floor"),
             operation="redirect",
-            parameters={"spread": 25.0},
+            parameters={"spread": 30.0},
             target="Geometry/Person",
         ),
     ),
     Shown(
         "staircase",
-        "-0.1",
+        "-3.9",
         New(
             "gamma",
             "Gamma: more contrast in what the ceiling sends stairs and statue.",
             receivers=("Geometry/Stairs", "Geometry/Statue"),
             casters=("Geometry/Hall/Ceiling",),
             operation="gamma",
-            parameters={"exponent": 2.0, "pivot": 0.35},
+            parameters={"exponent": 1.6, "pivot": 0.6},
         ),
     ),
     Shown(
