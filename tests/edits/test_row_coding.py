@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from icheat_usd.edits.encodings.coding import CodedRows, RowCoder
+from icheat_usd.edits.encodings.coding import CodedRows, ColumnsDiffer, RowCoder
 from icheat_usd.edits.encodings.sampled import cell_begins, contract, needed_nodes, tree_shape
 from icheat_usd.kernels import row_coding
 from icheat_usd.samples.tree import ClusterTree, build_tree
@@ -205,3 +205,19 @@ def test_cells_are_where_no_coefficient_divides():
 def test_splits_that_are_no_tree_are_refused(sizes):
     with pytest.raises(ValueError, match="binary tree"):
         tree_shape(np.array(sizes, np.int32), 2 if len(sizes) < 3 else 4)
+
+
+def test_columns_said_to_be_alike_are_coded_once_and_checked():
+    tree = random_tree(64, 14)
+    values = random_rows(4, 64, 6, 15)
+    values[..., 1] = values[..., 0]
+    values[..., 3:] = 0
+    alike = np.array([0, 0, 2, -1, -1, -1])
+    coder = RowCoder(tree, np.full(6, 0.05), alike=alike)
+    coder.add(values)
+    assert np.array_equal(decode(tree, coder.finish()), decode(tree, coded(tree, values, 0.05)))
+    for broken in (1, 4):
+        other = values.copy()
+        other[2, 5, broken] += 1
+        with pytest.raises(ColumnsDiffer):
+            RowCoder(tree, np.full(6, 0.05), alike=alike).add(other)

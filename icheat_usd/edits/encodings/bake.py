@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.edits.encodings.assemble import assemble
-from icheat_usd.edits.encodings.coding import RowCoder
+from icheat_usd.edits.encodings.coding import ColumnsDiffer, RowCoder
 from icheat_usd.edits.encodings.pair_samples import PAIRS_AT_ONCE, PairSamples
 from icheat_usd.edits.encodings.rows import Mixture, bind_rows
 from icheat_usd.edits.encodings.sampled import SampledRows, contract, tree_shape
@@ -129,8 +129,12 @@ def bake_field(
     contraction = contract(gather.tree.lo, gather.tree.mid, gather.tree.hi, work.leaves)
     area = gather.area[work.leaf_numbers]
     tree = build_tree(tree_shape(contraction.split_size, work.n_leaves), area.astype(np.float64), b"rows")
-    coder = RowCoder(tree, allowed, coefficients)
-    row_of_site, factor = work.code(coder, sites.samples, progress)
+    try:
+        coder = RowCoder(tree, allowed, coefficients, work.alike_columns(tests))
+        row_of_site, factor = work.code(coder, sites.samples, progress)
+    except ColumnsDiffer:
+        coder = RowCoder(tree, allowed, coefficients)
+        row_of_site, factor = work.code(coder, sites.samples, progress)
     coded = coder.finish()
     rows = assemble(coded, row_of_site, factor, sites, work, tree, area, snapshot)
     return BakedRows(rows, largest_error(work, [(rows, 1.0)], snapshot), int(work.touched.sum()), work.lost)

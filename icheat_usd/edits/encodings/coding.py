@@ -30,6 +30,10 @@ class CodedRows(NamedTuple):
     error: F64  #: (n_rows, k) largest difference at any leaf, quantisation and rounding included
 
 
+class ColumnsDiffer(Exception):
+    """Columns that were said to be alike are not."""
+
+
 class RowCoder:
     """Codes rows as they come; equal patterns are kept once.
 
@@ -41,11 +45,17 @@ class RowCoder:
         Largest difference allowed in each column; 0 where the column must be as exact as 16 bits make it.
     n_coefficients : int, optional
         Keep this many in each row instead, whatever the error.
+    alike : (k,) int, optional
+        An equal column of each, possibly itself, or -1 where it is 0 throughout: coded once, and checked.
     """
 
-    def __init__(self, tree: ClusterTree, tolerance: F64, n_coefficients: int | None = None) -> None:
+    def __init__(
+        self, tree: ClusterTree, tolerance: F64, n_coefficients: int | None = None, alike: I64 | None = None
+    ) -> None:
         self._tree = tree
-        self._tolerance = np.asarray(tolerance, np.float64)
+        self._alike = np.arange(len(tolerance)) if alike is None else alike
+        self._distinct = np.unique(np.append(self._alike[self._alike >= 0], self._alike.max(initial=-1).clip(0)))
+        self._tolerance = np.asarray(tolerance, np.float64)[self._distinct]
         self._n_kept = -1 if n_coefficients is None else min(n_coefficients, tree.n_leaves)
         self._known: dict[bytes, int] = {}
         self._patterns: list[tuple[I32, NDArray[np.int16]]] = []
@@ -54,8 +64,20 @@ class RowCoder:
         self._largest = BYTE
 
     def add(self, values: F32) -> None:
-        """Code rows (n, n_leaves, k) float32."""
-        values = np.ascontiguousarray(values, np.float32)
+        """Code rows (n, n_leaves, k) float32.
+
+        Raises
+        ------
+        ColumnsDiffer
+            Columns are not alike after all.
+        """
+        for column, like in enumerate(self._alike):
+            equal = (
+                not values[..., column].any() if like < 0 else np.array_equal(values[..., column], values[..., like])
+            )
+            if like != column and not equal:
+                raise ColumnsDiffer
+        values = np.ascontiguousarray(values[..., self._distinct], np.float32)
         coded = self._encode(values, self._largest)
         if self._largest == BYTE and not self._is_fine(coded[4]):
             self._largest = WORD
@@ -111,16 +133,20 @@ class RowCoder:
     def finish(self) -> CodedRows:
         """All rows that were added, in order."""
         k = len(self._tolerance)
+        place, zero = np.searchsorted(self._distinct, np.maximum(self._alike, 0)), self._alike < 0
         patterns, steps, errors = zip(*self._rows, strict=True) if self._rows else ((), (), ())
         lengths = [len(index) for index, _ in self._patterns]
         numbers = np.concatenate([np.zeros((0, k), np.int16), *(number for _, number in self._patterns)])
         if np.abs(numbers).max(initial=0) <= BYTE:
             numbers = numbers.astype(np.int8)
+        step = np.concatenate([np.zeros((0, k), np.float32), *steps])[:, place]
+        error = np.concatenate([np.zeros((0, k), np.float64), *errors])[:, place]
+        step[:, zero], error[:, zero] = 0, 0
         return CodedRows(
             np.concatenate([np.zeros(0, np.int32), *patterns]),
-            np.concatenate([np.zeros((0, k), np.float32), *steps]),
+            step,
             np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
             np.concatenate([np.zeros(0, np.int32), *(index for index, _ in self._patterns)]),
-            numbers,
-            np.concatenate([np.zeros((0, k), np.float64), *errors]),
+            np.ascontiguousarray(numbers[:, place]),
+            error,
         )

@@ -133,7 +133,8 @@ class PairSamples:
             return (self.receivers.masks[0] * np.float32(peak.max()))[:, None]
         touched = np.flatnonzero(self.touched)
         like, of = self._like(touched)
-        columns = self._telling_columns(tests)
+        columns = np.unique(self.alike_columns(tests))
+        columns = columns[columns >= 0] if (columns >= 0).any() else np.zeros(1, np.int64)
         tests = tests[:: len(columns)]  # as many numbers for a coloured edit as for a grey one
         step = max(1, PAIRS_AT_ONCE // len(tests))
         found = np.empty((len(like), len(tests) * len(columns)), np.float32)
@@ -145,17 +146,16 @@ class PairSamples:
         values[touched] = found[of]
         return values
 
-    def _telling_columns(self, tests: I64) -> I64:
-        """Columns of S, E and O that are neither 0 nor equal to another one, as far as some samples tell."""
+    def alike_columns(self, tests: I64) -> I64:
+        """An equal column of each of S, E and O, -1 where it is 0, as far as some samples tell."""
         some = np.flatnonzero(self.touched)
         some = some[np.random.default_rng(4).permutation(len(some))[:256]]
         values = self.pairs(some, tests).reshape(-1, 3 * len(self.kinds))
-        columns: list[int] = []
-        for column in range(values.shape[1]):
-            repeated = any(np.array_equal(values[:, column], values[:, other]) for other in columns)
-            if values[:, column].any() and not repeated:
-                columns.append(column)
-        return np.array(columns or [0], np.int64)
+        alike = np.full(values.shape[1], -1, np.int64)
+        for column in np.flatnonzero(values.any(axis=0)):
+            equal = [c for c in range(column) if alike[c] == c and np.array_equal(values[:, column], values[:, c])]
+            alike[column] = equal[0] if equal else column
+        return alike
 
     def code(self, coder: RowCoder, sites: I64, progress: Progress) -> tuple[I64, F32]:
         """Code the rows of the sites: row of each (-1: identity), and its factor."""
