@@ -15,22 +15,46 @@ from icheat_usd.resources import resource_path
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def block(language: str) -> str:
-    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
-    return str(found)
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
 
 
 def test_the_python_example_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(compile(block("python"), "README.md", "exec"), {})
+    first, _ = blocks("python")
+    exec(compile(first, "README.md", "exec"), {})
     assert float(capsys.readouterr().out) > 1.01
     assert (tmp_path / "after.exr").is_file() and (tmp_path / "after.png").is_file()
 
 
+def test_the_pipeline_script_overrides_publishes_checks_and_compares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _, script = blocks("python")
+    exec(compile(script, "README.md", "exec"), {})
+    published, *shots = capsys.readouterr().out.splitlines()
+    assert published == "3 payloads in sequence.published.v001.icheat.h5"
+    assert len(shots) == 10
+    for number, line in enumerate(shots):
+        assert line.startswith(f"sh{10 * (number + 1):03d}.usda 0 findings; ")
+        for change in (
+            f"wallOnPerson: amount 1 → {number / 10:g}",
+            "key at 28: gain 8 → 4",
+            "wallOnCouch: key",
+            "spill muted",
+        ):
+            assert change in line
+    # The sequence's file is as it was but for the name of its sidecar; the shots wrote only to their own.
+    assert "sequence.published.v001.icheat.h5" in (tmp_path / "film" / "sequence.usda").read_text()
+    assert "sequence.v001" not in (tmp_path / "film" / "sequence.usda").read_text()
+
+
 def test_the_shell_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    copy, *commands = block("sh").splitlines()
+    (example,) = blocks("sh")
+    copy, *commands = example.splitlines()
     assert copy == "cp -r sample_stages/cornell_box . && cd cornell_box"
     shutil.copytree(resource_path("sample_stages/cornell_box"), tmp_path / "cornell_box")
     monkeypatch.chdir(tmp_path / "cornell_box")
