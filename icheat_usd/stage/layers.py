@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from pxr import Ar, Sdf, Tf, Usd
 
@@ -123,7 +123,19 @@ def save_layer(layer: Sdf.Layer) -> None:
             ) from error
         if not saved:
             raise EditError(f"{layer.realPath} cannot be saved; check its permissions")
+        _flush(layer.realPath)
         _seen_on_disk[layer.identifier] = _on_disk(layer)
+
+
+def _flush(file: str) -> None:
+    """Have a saved file on the disk before anything counts on it: USD writes and renames, and leaves the rest to luck."""
+    for path in (file, os.path.dirname(file)):
+        with suppress(OSError):  # Some file systems cannot flush a folder.
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
 
 
 def _first_line(error: Tf.ErrorException) -> str:
