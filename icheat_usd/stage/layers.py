@@ -128,7 +128,7 @@ def save_layer(layer: Sdf.Layer) -> None:
 
 
 def _flush(file: str) -> None:
-    """Have a saved file on the disk before anything counts on it: USD writes and renames, and leaves the rest to luck."""
+    """Have a saved file on the disk before anything counts on it: USD writes and renames, but does not flush."""
     for path in (file, os.path.dirname(file)):
         with suppress(OSError):  # Some file systems cannot flush a folder.
             descriptor = os.open(path, os.O_RDONLY)
