@@ -90,6 +90,8 @@ def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
         }
 
     for name, edit in made_up_edits(session).items():
+        if arguments.edits and name not in arguments.edits:
+            continue
         operation = find(edit.operation)
         assert operation is not None
         complete = operation.complete(edit.parameters, edit.path)
@@ -123,6 +125,7 @@ def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
                 f" {found['sites']:,} sites, scale within {found['epsilon_scale']:.2g}, seen {found['measured']:.2g}"
                 + (
                     f", image max {found['image_error_max']:.2g} rms {found['image_error_rms']:.2g}"
+                    f" of an edit of rms {found['edit_rms']:.2g}"
                     if arguments.images
                     else ""
                 ),
