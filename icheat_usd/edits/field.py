@@ -70,6 +70,7 @@ class Aggregate(NamedTuple):
     edit: int
     key: int
     row: int  #: of the masks
+    upto: int  #: edits before this one have acted on the light that it sees; none where it replaces or adds to them
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +126,7 @@ class EditField:
 
     Use: `receivers` and `casters` once for all points, `Ends.take` to form
     pairs, `evaluate` on these. Where `aggregates` has entries, each is resolved
-    in turn from the light of its casters as the weaker edits leave it; its
+    in turn from the light of its casters under the edits before its `upto`; its
     scales are then given to `evaluate`. `finish` applies what acts on views.
     """
 
@@ -181,7 +182,9 @@ class EditField:
         found, row = [], 0
         for index, bound in enumerate(self.edits):
             if bound.level is Level.AGGREGATE:
-                found += [Aggregate(index, key, row + key) for key in range(bound.n_keys)]
+                # As pairs: an edit that is not composed with the weaker ones does not look at what they leave.
+                upto = index if bound.edit.blend is Blend.COMPOSE else 0
+                found += [Aggregate(index, key, row + key, upto) for key in range(bound.n_keys)]
             row += bound.n_keys
         return tuple(found)
 
@@ -354,7 +357,8 @@ class EditField:
         Parameters
         ----------
         light : (n, 3) float32, radiance
-            All that n receivers get from the casters, weighted by the casters' masks, as the weaker edits leave it.
+            All that n receivers get from the casters, weighted by the casters' masks, under the edits before
+            `aggregate.upto`.
 
         Returns
         -------

@@ -102,7 +102,7 @@ def edited_light(
             resolved.append(np.ones((n, 3), np.float32))
             continue
         # Keys of one edit see the same weaker stack.
-        scale, rest = field.resolve(aggregate, total(resolved, aggregate.edit, aggregate))
+        scale, rest = field.resolve(aggregate, total(resolved, aggregate.upto, aggregate))
         resolved.append(scale)
         added += weight * rest
     return total(resolved) + added

@@ -178,7 +178,7 @@ def edited_radiance(
         for aggregate in field.aggregates:
             bound = field.edits[aggregate.edit]
             # Keys of one edit see the same weaker stack.
-            light = total(resolved, aggregate.edit, aggregate.row, bound.groups)
+            light = total(resolved, aggregate.upto, aggregate.row, bound.groups)
             scale, rest = field.resolve(aggregate, light.astype(np.float32)[None, :])
             resolved.append(scale[0].astype(np.float64))
             added = added + field.aggregate_weight(aggregate, receiver)[0] * rest[0]

@@ -78,8 +78,8 @@ class _SharedReceivers:
             mask = self.masks[key][:, None]
             if bound.level is Level.AGGREGATE:
                 assert bound.edit.blend is Blend.COMPOSE
-                aggregate = Aggregate(self.last, key, row)
-                seen = self.light(upto=self.last, aggregate=aggregate)
+                aggregate = Aggregate(self.last, key, row, upto=self.last)
+                seen = self.light(upto=aggregate.upto, aggregate=aggregate)
                 scale, added = self.field.resolve(aggregate, seen)
                 weight = np.float32(bound.edit.amount * bound.key_weights[key]) * mask
                 result += weight * ((scale - ONE) * seen + added)

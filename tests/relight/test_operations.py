@@ -203,6 +203,17 @@ def test_baked_rows_equal_the_slow_evaluator(n_keys, monkeypatch):
     assert_equals_the_slow_evaluator("full", (warm, rows, curve), monkeypatch)
 
 
+@pytest.mark.parametrize("operation", sorted(set(PARAMETERS) - {"receive"}))
+def test_full_over_shows_the_edit_alone(operation):
+    """Curves too: what they replace, they do not look at."""
+    of = pipeline("full")
+    weaker = edit("weaker", "scale"), edit("turn", "hsv")
+    strong = edit("op", operation, blend=Blend.OVER)
+    alone, both = (of.relighter.relight(of.field(*edits)).indirect_edited for edits in ((strong,), (*weaker, strong)))
+    assert np.abs(alone - of.relight().indirect).max() > 0.003
+    np.testing.assert_allclose(both, alone, atol=1e-5 * np.abs(alone).max())
+
+
 def test_patches_of_casters_stand_for_all_of_them(monkeypatch):
     """Where each receiver has offsets of its own: exact where the edits are the same within a patch."""
     parts = Pipeline(room(8), n_gather=3000, rays=32, bounce_rays=32, light_samples=4, n_bounces=2)
