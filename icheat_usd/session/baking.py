@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.encodings.bake import (
@@ -24,7 +27,7 @@ from icheat_usd.edits.model import Blend, Edit, EditStack, Payload
 from icheat_usd.edits.operations import Level, find
 from icheat_usd.errors import EditError
 from icheat_usd.progress import Progress, silent
-from icheat_usd.scene import Finding
+from icheat_usd.scene import Bool, Finding
 from icheat_usd.session.authoring import anchor_of
 from icheat_usd.session.document import Session
 from icheat_usd.session.inspection import describe_stack
@@ -37,6 +40,7 @@ from icheat_usd.stage.authoring import Members
 from icheat_usd.stage.edit_stack import anchor_path
 from icheat_usd.stage.keys import read_keys
 from icheat_usd.stage.stacks import EditFinding, edit_prim
+from icheat_usd.transport import sum_lights
 
 #: Operation of an edit that is evaluated by what is baked.
 BAKED = "baked"
@@ -147,12 +151,13 @@ def bake_edits(
     written: list[Path] = []
     keys: list[BakedKey] = []
     try:
-        for path, parts in made.items():
-            payloads = [key.payload for key in parts]
-            anchor = anchor_path(edit_prim(stage, path))
-            file, digests = write_payloads(beside, payloads, anchor=anchor, history=history_entry(why, path))
-            written.append(file)
-            with layers.writing(stage, target, path):
+        with ExitStack() as all_or_none:
+            for path, parts in made.items():
+                payloads = [key.payload for key in parts]
+                anchor = anchor_path(edit_prim(stage, path))
+                file, digests = write_payloads(beside, payloads, anchor=anchor, history=history_entry(why, path))
+                written.append(file)
+                all_or_none.enter_context(layers.writing(stage, target, path))
                 for key, digest in zip(parts, digests, strict=True):
                     findings += key_authoring.set_payload_key(
                         stage, path, layer=target, time=key.time, payload=(file, digest)
@@ -160,7 +165,7 @@ def bake_edits(
                     keys.append(_described(path, key, file, digest))
                 if forget_recipe:
                     findings += authoring.set_edit(stage, path, layer=target, operation=BAKED)
-        _save(target)
+            _save(target)
     except Exception:
         # Not after an interruption: the layer may have been saved already, and then names these files.
         for file in written:
@@ -245,7 +250,9 @@ def flatten_stack(
     try:
         history = history_entry(why, f"{stack_path}/{name}")
         file, digests = write_payloads(beside, [key.payload for key in made], anchor=anchor, history=history)
-        with layers.writing(stage, target, stack_path):
+        with ExitStack() as all_or_none:
+            for place in (stack_path, *parts):
+                all_or_none.enter_context(layers.writing(stage, target, place))
             path = authoring.add_edit(
                 stage,
                 stack_path,
@@ -265,7 +272,7 @@ def flatten_stack(
                 findings += key_authoring.set_payload_key(stage, path, layer=target, time=time, payload=None)
             for part in parts:
                 findings += authoring.set_edit(stage, part, layer=target, enabled=False)
-        _save(target)
+            _save(target)
     except Exception:
         if file is not None:
             file.unlink(missing_ok=True)
@@ -334,11 +341,18 @@ def _bake_key(sessions: _Sessions, path: str, time: float | None, epsilon: float
     if find(edit.operation) is None:
         raise EditError(f"{path}: operation '{edit.operation}' is not known here, so nothing can be baked anew from it")
     field = bind(at_full_amount(edit), session.snapshot)
-    baked = _bake(session, field, path, epsilon, coefficients)
+    baked = _bake(session, field, path, epsilon, coefficients, _lights_of(edit, session))
     anchor = anchor_path(edit_prim(session.stage, path))
     made_against = facts(session.snapshot, anchor, edit=edit)
     payload = payload_at(session.stage, path, time, made_against)
     return _Key(time, replace(payload, rows=baked.rows, made_against=made_against), baked)
+
+
+def _lights_of(edit: Edit, session: Session) -> Bool:
+    """(n_lights,) the lights whose light the edit looks at."""
+    field = bind(EditStack(path="", edits=(replace(edit, amount=1.0, enabled=True),)), session.snapshot)
+    acts = field.edits[0].groups if field.edits else np.zeros(field.n_groups, np.bool_)
+    return np.asarray(acts[field.light_group], np.bool_)
 
 
 def _pair_edits(stack: EditStack) -> EditStack:
@@ -366,9 +380,16 @@ def _bake_stack(
     return _bake(session, field, where, epsilon, coefficients)
 
 
-def _bake(session: Session, field: EditField, where: str, epsilon: float, coefficients: int | None) -> BakedRows:
+def _bake(
+    session: Session,
+    field: EditField,
+    where: str,
+    epsilon: float,
+    coefficients: int | None,
+    lights: Bool | None = None,
+) -> BakedRows:
     check_bakeable(field, where)
-    radiance, transport = _light(session, field)
+    radiance, transport = _light(session, field, lights)
     return bake_field(
         field,
         session.view,
@@ -383,9 +404,12 @@ def _bake(session: Session, field: EditField, where: str, epsilon: float, coeffi
     )
 
 
-def _light(session: Session, field: EditField) -> tuple[Any, Any]:
-    """Radiance and transport, computed only where the field looks at light."""
-    radiance = session.cell_light.total() if field.uses_incident or field.aggregates else None
+def _light(session: Session, field: EditField, lights: Bool | None = None) -> tuple[Any, Any]:
+    """Radiance of some lights, all by default, and transport; computed only where the field looks at light."""
+    if not field.uses_incident and not field.aggregates:
+        return None, None
+    per_light = session.cell_light.radiance
+    radiance = sum_lights(per_light if lights is None else per_light[lights])
     return radiance, session.transport if field.aggregates else None
 
 
@@ -396,6 +420,8 @@ def _warnings(sessions: _Sessions, path: str, keys: list[_Key], forget_recipe: b
     found: list[Finding] = []
     if operation is not None and (operation.uses_incident or operation.level is Level.AGGREGATE):
         text = f"operation '{operation.name}' looks at the light, so its rows hold for the lights as they are now"
+        if edit.blend is Blend.COMPOSE and any(other.path != path for other in session.stack.active[:1]):
+            text += ", without what weaker edits make of it; to keep that, flatten the stack instead"
         found.append(EditFinding(path, "icheat:payload", text))
     soft = (
         edit.receivers.limits

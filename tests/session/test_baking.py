@@ -130,7 +130,43 @@ def test_what_cannot_be_baked_is_refused_and_nothing_is_left_behind(operations):
 def test_light_and_blend_are_warned_about(operations):
     stage = open_stage(operations / "hsv.usda")
     done = bake_edits(stage, ["/World/Edits/hsv"], layer="hsv.usda", shot=SHOT)
-    assert any("lights as they are now" in finding.message for finding in done.findings)
+    (finding,) = done.findings
+    assert "lights as they are now" in finding.message and "weaker" not in finding.message
+    session(stage).add_edit("weaker", layer="hsv.usda", receivers=["Geometry"], casters=["Geometry"], before="hsv")
+    (finding,) = bake_edits(stage, ["/World/Edits/hsv"], layer="hsv.usda", shot=SHOT).findings
+    assert "flatten the stack" in finding.message
+
+
+def test_rows_of_an_edit_of_some_lights_look_at_these_alone(operations):
+    """The sun's light turned blue stays what it was when the rows were made from it, not from all lights together."""
+    stage = open_stage(operations / "one_light.usda")
+    edit = "/World/Edits/one_light"
+    session(stage).set_edit(edit, layer="one_light.usda", operation="hsv", parameters={"hue": 90.0})
+    before = session(stage).relight()
+    (key,) = bake_edits(stage, [edit], layer="one_light.usda", shot=SHOT, forget_recipe=True).keys
+    after = session(stage).relight()
+    change = indirect(before) - indirect(before, "indirect")
+    assert np.abs(change).max() > 0.05
+    assert np.abs(indirect(after) - indirect(before)).mean() < 0.05 * np.abs(change).mean()
+
+
+def test_a_layer_that_cannot_be_saved_is_as_before(operations, monkeypatch):
+    stage = open_stage(operations / "scale.usda")
+    text = stage.GetRootLayer().ExportToString()
+    files = sorted(p.name for p in operations.iterdir())
+
+    def refuse(layer):
+        raise EditError("no space")
+
+    monkeypatch.setattr("icheat_usd.stage.layers.save_layer", refuse)
+    for bake in (
+        lambda: bake_edits(stage, [SCALE], layer="scale.usda", shot=SHOT, forget_recipe=True),
+        lambda: flatten_stack(stage, "Frozen", layer="scale.usda", shot=SHOT),
+    ):
+        with pytest.raises(EditError, match="no space"):
+            bake()
+        assert stage.GetRootLayer().ExportToString() == text
+        assert sorted(p.name for p in operations.iterdir()) == files
 
 
 def test_the_command_line_bakes_and_says_what_it_costs(operations, capsys):
