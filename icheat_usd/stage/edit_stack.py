@@ -68,7 +68,8 @@ def read_edit_stack(
     surface_paths
         Scene paths of all surfaces, which the edits' collections select from.
     read_payload
-        Called for each payload that takes part at `time`. Muted edits and those of amount 0 read none.
+        Called for each payload that takes part at `time`. Muted edits, those of amount 0 and those of a stack that is
+        off read none.
 
     Returns
     -------
@@ -87,19 +88,24 @@ def read_edit_stack(
     prim = stack_prim(stage, stack_path)
     prims, findings = listed_edits(prim)
     paths = frozenset(surface_paths)
+    enabled = read_flag(prim, schema.STACK_ENABLED, time)
     edits = []
     for edit in prims:
-        read, more = _read_edit(edit, time, paths, read_payload)
+        read, more = _read_edit(edit, time, paths, read_payload, is_used=enabled)
         edits.append(read)
         findings += more
-    enabled = read_flag(prim, schema.STACK_ENABLED, time)
     stack = EditStack(path=stack_path, edits=tuple(edits), enabled=enabled)
     anchors = {str(edit.GetPath()): anchor_path(edit) for edit in prims}
     return replace(stack, digest=stack_digest(stack, anchors)), tuple(findings)
 
 
 def _read_edit(
-    prim: Usd.Prim, time: float | None, surface_paths: frozenset[str], read_payload: PayloadReader | None
+    prim: Usd.Prim,
+    time: float | None,
+    surface_paths: frozenset[str],
+    read_payload: PayloadReader | None,
+    *,
+    is_used: bool,
 ) -> tuple[Edit, list[EditFinding]]:
     path = str(prim.GetPath())
     track = read_keys(prim)
@@ -115,14 +121,15 @@ def _read_edit(
         enabled=read_flag(prim, schema.ENABLED, time),
         occluders=targets(prim, schema.OCCLUDERS),
     )
-    receivers, casters = (_select(prim, name, surface_paths, edit) for name in (schema.RECEIVERS, schema.CASTERS))
+    is_used = is_used and edit.is_active
+    receivers, casters = (_select(prim, name, surface_paths, is_used) for name in (schema.RECEIVERS, schema.CASTERS))
     edit = replace(edit, receivers=receivers, casters=casters)
     findings = [
         EditFinding(path, name, f"selects no surface, so the edit does nothing; include prims in {name}")
         for name, selection in ((schema.RECEIVERS, edit.receivers), (schema.CASTERS, edit.casters))
-        if edit.is_active and not selection.paths
+        if is_used and not selection.paths
     ]
-    if not edit.is_active:
+    if not is_used:
         return edit, findings
     edit, more = with_limits(prim, edit, time, surface_paths)
     if track is not None:
@@ -132,13 +139,13 @@ def _read_edit(
     return edit, [*findings, *more, *misplaced]
 
 
-def _select(prim: Usd.Prim, name: str, surface_paths: frozenset[str], edit: Edit) -> Selection:
+def _select(prim: Usd.Prim, name: str, surface_paths: frozenset[str], is_used: bool) -> Selection:
     try:
         return collections.select(prim, name, surface_paths)
     except EditError:
-        if edit.is_active:
+        if is_used:
             raise
-        return _NOTHING  # A muted edit is never in the way.
+        return _NOTHING  # What is muted is never in the way.
 
 
 def _read_key(prim: Usd.Prim, key: Key, weight: float, read_payload: PayloadReader | None) -> KeyedPayload:
@@ -170,7 +177,11 @@ def open_asset(prim: Usd.Prim, key: Key) -> str | bytes:
 
 
 def _with_recipes(prim: Usd.Prim, edit: Edit, time: float | None) -> Edit:
-    """Lay authored parameters over each payload's recipe, and the recipes under the edit's own parameters."""
+    """Lay authored parameters over each payload's recipe, and the recipes under the edit's own parameters.
+
+    The recipe of another operation, from before the edit was given a new one, says nothing about this one; the
+    payload's masks stay.
+    """
     operation = edit.operation
     recipes = [key.payload for key in edit.keys if key.payload is not None]
     if recipes and strongest_opinion(prim.GetAttribute(schema.OPERATION)) is None:
@@ -180,9 +191,10 @@ def _with_recipes(prim: Usd.Prim, edit: Edit, time: float | None) -> Edit:
     keys = []
     for key in edit.keys:
         payload = key.payload
-        if payload is not None and payload.operation == operation:
-            complete = {**fallbacks, **payload.parameters, **authored}
-            payload = replace(payload, parameters=MappingProxyType(complete))
+        if payload is not None and (payload.operation == operation or operation in schema.operations()):
+            recipe = payload.parameters if payload.operation == operation else {}
+            complete = MappingProxyType({**fallbacks, **recipe, **authored})
+            payload = replace(payload, operation=operation, parameters=complete)
         keys.append(replace(key, payload=payload))
     complete_keys = [(k.payload.parameters, k.weight) for k in keys if k.payload and k.payload.operation == operation]
     mixed = mix_parameters(complete_keys) if complete_keys else {**fallbacks, **authored}

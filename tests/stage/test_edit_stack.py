@@ -215,6 +215,25 @@ def test_recipes_of_two_keys_mix_by_their_weights(stage: Usd.Stage, tmp_path: Pa
     assert [key.payload.parameters["gain"] for key in edit.keys if key.payload] == [1.0, 5.0]
 
 
+def test_an_edit_that_was_given_another_operation_forgets_the_recipe_of_the_first(
+    stage: Usd.Stage, tmp_path: Path
+) -> None:
+    path = add(stage, "warm", payload=(tmp_path / "edits.v001.icheat.h5", DIGEST))
+    set_edit(stage, path, layer="shot.usda", operation="hsv", parameters={"hue": 30.0})
+    (edit,) = read_edit_stack(stage, STACK, None, SURFACES, RecordingReader(gain=3.0))[0].edits
+    (key,) = edit.keys
+    assert key.payload is not None and key.payload.operation == "hsv"
+    assert dict(key.payload.parameters) == dict(edit.parameters) == {"hue": 30.0, "saturation": 1.0, "value": 1.0}
+
+
+def test_the_edits_of_a_stack_that_is_off_need_no_sidecar(stage: Usd.Stage, tmp_path: Path) -> None:
+    add(stage, "warm", payload=(tmp_path / "gone.icheat.h5", DIGEST))
+    stage.GetPrimAtPath(STACK).GetAttribute(schema.STACK_ENABLED).Set(False)
+    reader = RecordingReader()
+    found, findings = read_edit_stack(stage, STACK, None, SURFACES, reader)
+    assert not found.enabled and not found.active and not findings and reader.calls == []
+
+
 def test_a_muted_edit_needs_no_sidecar_and_an_active_one_names_what_is_missing(
     stage: Usd.Stage, tmp_path: Path
 ) -> None:
