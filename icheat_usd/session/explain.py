@@ -148,6 +148,8 @@ class _PixelLight:
     def mask(self, edit: Edit) -> float:
         """Mean receiver mask, keys weighted as they are, samples by how much of the pixel they are."""
         field = bind(EditStack("", (edit,)), self.session.snapshot)
+        if field.is_identity:  # It rests at this time: its key is blocked, or its lights are out.
+            return 0.0
         weights = np.array(field.edits[0].key_weights, np.float64)
         of_sample = weights @ field.receiver_masks(self.view.points).astype(np.float64)
         part = self.view.throughput.astype(np.float64) @ _LUMINANCE

@@ -95,6 +95,13 @@ def test_a_pixel_that_no_edit_reaches_says_so(session):
     assert found.touching == () and found.indirect == found.indirect_edited
 
 
+def test_an_edit_that_rests_changes_nothing(session):
+    session.set_edit("/World/Edits/grey", layer="shot.usda", lights=["/World/Block"])
+    found = explain_pixel(session, 12, 9, rays=32)
+    (grey,) = (share for share in found.edits if share.edit.endswith("grey"))
+    assert grey.change == (0.0, 0.0, 0.0) and grey.mask == 0.0 and grey.casters == ()
+
+
 def test_a_stack_that_is_off_explains_nothing(session):
     session.stage.GetPrimAtPath("/World/Edits").GetAttribute("icheat:stackEnabled").Set(False)
     found = explain_pixel(session, 12, 9)
