@@ -308,7 +308,10 @@ class _Made:
         if implementation is None:
             return payload
         complete = implementation.complete(payload.parameters, str(self.prim.GetPath()))
-        return replace(payload, **baked_constants(implementation, complete))
+        # What is baked of the parameters that the payload had must not outlive them.
+        found = baked_constants(implementation, complete)
+        constants = {name: found.get(name) for name in ("scale_delta", "emission", "offset")}
+        return replace(payload, **constants)  # type: ignore[arg-type]
 
     def _mixed_mask(self, side: str) -> SurfaceMask | None:
         """The mask half way between those of the keys around: exact where they cover the same surfaces."""

@@ -78,6 +78,24 @@ def test_keys_hold_what_operations_would_bake_for_readers_that_do_not_know_them(
     assert payload_at(stage, 11).scale_delta == (1.5, 0.25, -1.0)
 
 
+def test_what_is_baked_of_other_keys_goes_where_it_no_longer_holds(stage: Usd.Stage) -> None:
+    """As a factor, the colour is the same for all pairs; in place of the casters' own it is not."""
+    session = Session.open(stage, camera="/World/camera", frame=1)
+    edit = session.add_edit("other", layer="seq.usda", operation="albedo", receivers=["floor"], casters=["Room"])
+    keys.set_key(stage, edit, layer="seq.usda", frame=1, parameters={"color": (0.5, 0.5, 0.5), "replace": False})
+
+    def baked(time: float) -> tuple[float, float, float] | None:
+        stack, _ = read_edit_stack(stage, STACK, time, SURFACES, authoring.read_payload)
+        (key,) = stack.edits[1].keys
+        assert key.payload is not None
+        return key.payload.scale_delta
+
+    assert baked(1) == (-0.5, -0.5, -0.5)
+    session.set_edit(edit, layer="seq.usda", parameters={"replace": True})
+    keys.set_key(stage, edit, layer="seq.usda", frame=11, parameters={"replace": True})
+    assert baked(1) is None and baked(11) is None
+
+
 def test_values_that_other_keys_held_follow_when_a_parameter_is_authored_and_keyed_again(stage: Usd.Stage) -> None:
     for frame, gain in ((1, 2.0), (21, 4.0)):
         keys.set_key(stage, WARM, layer="seq.usda", frame=frame, parameters={"gain": gain})
