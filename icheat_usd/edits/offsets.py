@@ -17,7 +17,7 @@ from icheat_usd.edits.field import Aggregate, EditField, Ends
 from icheat_usd.edits.operations import Level, Operation
 from icheat_usd.scene import F32, F64, I64, Bool
 
-#: Pairs of receivers and gather samples evaluated at once.
+#: Pairs evaluated at once; bounds memory and keeps the arrays of a step near the caches.
 PAIRS_AT_ONCE = 1 << 17
 
 #: Where every receiver has offsets of its own, more casters than this are gathered into patches.

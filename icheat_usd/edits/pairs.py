@@ -8,11 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.edits.field import Aggregate, EditField, Ends, StackCoefficients, weighted
-from icheat_usd.edits.offsets import OffsetCasters, offset_radiance
+from icheat_usd.edits.offsets import PAIRS_AT_ONCE, OffsetCasters, offset_radiance
 from icheat_usd.scene import F32, I64
-
-#: Pairs evaluated at once; bounds memory and keeps the arrays of a step near the caches.
-PAIRS_AT_ONCE = 1 << 17
 
 
 class PairLight(NamedTuple):
