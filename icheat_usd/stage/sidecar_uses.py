@@ -69,9 +69,12 @@ def layers_below(root: str) -> list[str]:
     def unreadable(problem: OSError) -> None:
         raise StageError(f"{problem.filename} cannot be listed ({problem.strerror}); check its permissions")
 
-    found = []
-    for folder, folders, names in os.walk(root, onerror=unreadable):
-        folders[:] = sorted(name for name in folders if name != TRASH)
+    found, seen = [], set()
+    # Linked folders too: what their layers name must stay. A link may lead back up.
+    for folder, folders, names in os.walk(root, onerror=unreadable, followlinks=True):
+        real = os.path.realpath(folder)
+        folders[:] = [] if real in seen else sorted(name for name in folders if name != TRASH)
+        seen.add(real)
         found += [os.path.join(folder, name) for name in sorted(names) if name.lower().endswith(LAYER_SUFFIXES)]
     return found
 

@@ -156,6 +156,19 @@ def test_gc_finds_every_place_that_names_a_sidecar(place: str, how: str, shot: P
     assert (folder / "shot.v001.icheat.h5").exists()
 
 
+def test_gc_reads_layers_in_linked_folders(shot: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    text = HIDDEN["an absolute path"].replace("FOLDER", str(shot.parent))
+    (elsewhere / "other.usda").write_text("#usda 1.0\n" + text)
+    (elsewhere / "back").symlink_to(shot.parent)
+    _age(shot.parent)
+    assert len(housekeeping.collect([str(shot.parent)]).unnamed) == 1
+    (shot.parent / "linked").symlink_to(elsewhere)
+    found = housekeeping.collect([str(shot.parent)], move=True)
+    assert not found.problems and not found.unnamed and (shot.parent / "shot.v001.icheat.h5").exists()
+
+
 def test_gc_moves_nothing_when_a_layer_cannot_be_read(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _age(shot.parent)
     for name, text in (
