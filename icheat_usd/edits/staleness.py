@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from icheat_usd.edits.facts import (
 )
 from icheat_usd.edits.model import Payload, Value
 from icheat_usd.edits.operations.base import Level, Operation
-from icheat_usd.scene import F64, Surface
+from icheat_usd.scene import F64
 
 __all__ = [
     "Aspect",
@@ -33,7 +33,6 @@ __all__ = [
     "camera_changes",
     "changes",
     "facts",
-    "mask_changes",
     "needs",
     "selection_facts",
     "stale_because",
@@ -122,26 +121,6 @@ def baked_parameters(payload: Payload, parameters: Mapping[str, Value]) -> tuple
         if was is not None and not _same_value(was, value):
             found.append(f"{name} is {value_text(value)}, and was {value_text(was)} when it was baked")
     return tuple(found)
-
-
-def mask_changes(payload: Payload, surfaces: Iterable[Surface]) -> tuple[str, ...]:
-    """Painted surfaces that are gone or have other faces than when they were painted, in words."""
-    known = {(surface.path, surface.instance_id, surface.part): surface.topology_digest for surface in surfaces}
-    gone, other = [], []
-    masks = [mask for mask in (payload.receiver_mask, payload.caster_mask) if mask is not None]
-    for surface in dict.fromkeys(surface for mask in masks for surface in mask.surfaces):
-        now = known.get((surface.path, surface.instance_id, surface.part))
-        if now is None:
-            gone.append(surface.path)
-        elif surface.topology_digest and now and surface.topology_digest != now:
-            other.append(surface.path)
-    return tuple(
-        change.text
-        for change in (
-            *_counted(Aspect.GEOMETRY, gone, "painted surface", "is gone", "are gone"),
-            *_counted(Aspect.GEOMETRY, other, "painted surface", "has other faces", "have other faces"),
-        )
-    )
 
 
 def changes(then: Mapping[str, str | float | int], now: Mapping[str, str | float | int]) -> tuple[Change, ...]:

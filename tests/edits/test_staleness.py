@@ -11,7 +11,7 @@ import pytest
 
 from icheat_usd.edits import operations, staleness
 from icheat_usd.edits.facts import MAX_SURFACES, facts
-from icheat_usd.edits.model import Edit, MaskedSurface, Payload, Region, Selection, Shape, SurfaceMask
+from icheat_usd.edits.model import Edit, Payload, Region, Selection, Shape
 from icheat_usd.edits.staleness import Aspect, changes, needs, stale_because
 from icheat_usd.scene import LightKind, SceneSnapshot
 from tests.scenes import Light, Material, Mesh, box, cornell, look_at, make_snapshot, quad, rotation, translation
@@ -167,24 +167,6 @@ def test_a_changed_selection_is_noticed() -> None:
     sphere = Region(Shape.SPHERE, tuple(float(x) for x in np.eye(3, 4).ravel()))
     assert found(edit("/World", sphere)) == ["the edit has other casters"]
     assert found(edit("/World", occluders=("/World/Block",))) == ["the edit has another target, lights or occluders"]
-
-
-def test_painted_surfaces_that_changed_are_named() -> None:
-    scene = room()
-    scene = dataclasses.replace(
-        scene, surfaces=tuple(dataclasses.replace(s, topology_digest="aa") for s in scene.surfaces)
-    )
-    surfaces = (
-        MaskedSurface("/World/Floor", 1, topology_digest="aa"),
-        MaskedSurface("/World/Block", 1, topology_digest="bb"),
-    )
-    mask = SurfaceMask((*surfaces, MaskedSurface("/World/Gone", 1)), np.zeros((3, 1, 1), np.float32))
-    assert staleness.mask_changes(Payload("scale", {}, receiver_mask=mask), scene.surfaces) == (
-        "painted surface /World/Gone is gone",
-        "painted surface /World/Block has other faces",
-    )
-    good = SurfaceMask(surfaces[:1], np.zeros((1, 1, 1), np.float32))
-    assert staleness.mask_changes(Payload("scale", {}, caster_mask=good), scene.surfaces) == ()
 
 
 def test_parameters_that_moved_on_since_the_bake_are_named() -> None:
