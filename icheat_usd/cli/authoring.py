@@ -9,11 +9,20 @@ from icheat_usd.errors import EditError
 
 
 def open_for_writing(options: argparse.Namespace) -> tuple[Any, str]:
-    """The stage, and the layer to write to: --layer, else the stage's root layer."""
-    from icheat_usd.session import inspection
+    """The stage, and the layer to write to: --layer, else the stage's root layer.
+
+    Raises
+    ------
+    EditError
+        The stage cannot be written to, or the layer has no file and would be gone when the program ends.
+    """
+    from icheat_usd.session import authoring, inspection
 
     stage = inspection.open_stage(options.stage)
-    return stage, options.layer or stage.GetRootLayer().identifier
+    layer = options.layer or stage.GetRootLayer().identifier
+    if not authoring.is_kept(stage, layer):
+        raise EditError(f"layer '{layer}' has no file, so nothing of it would stay; name a layer with a file")
+    return stage, layer
 
 
 def named_edit(stage: Any, options: argparse.Namespace) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from icheat_usd.cli.options import add_frame, add_json, finding_as_json, finding_as_text, print_json
+from icheat_usd.cli.options import add_frame, add_json, finding_as_json, finding_as_text, print_json, severity
 from icheat_usd.errors import EditError
 
 
@@ -34,7 +34,7 @@ def command(options: argparse.Namespace) -> int:
     else:
         for finding in findings:
             print(finding_as_text(finding))
-    counted = [f for f in findings if not options.errors or getattr(f, "severity", "warning") == "error"]
+    counted = [f for f in findings if not options.errors or severity(f) == "error"]
     return 1 if counted else 0
 
 

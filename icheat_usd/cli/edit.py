@@ -20,6 +20,7 @@ from icheat_usd.cli.options import (
     add_stage,
     add_variant,
     add_why,
+    aligned,
     assignment,
     finding_as_json,
     finding_as_text,
@@ -80,8 +81,11 @@ def _verb(
     if writes:
         add_layer(parser)
         add_variant(parser)
-    if name in ("add", "set", "list"):
+    if name == "list":
         add_frame(parser)
+    elif name in ("add", "set"):
+        key = ", and the payload a key there" if name == "add" else ""
+        add_frame(parser, f"let the values be time samples at this time{key}; default: values for all times")
     add_json(parser)
     parser.set_defaults(command=command)
     return parser
@@ -163,11 +167,7 @@ def add_command(options: argparse.Namespace) -> int:
     else:
         stack = inspection.find_stack(stage, options.stack, options.camera)
         path = authoring.add_edit(stage, stack, options.name, **values)
-    if options.json:
-        print_json({"edit": path, "layer": layer})
-    else:
-        print(path)
-    return 0
+    return _report(options, path, layer, inspection.idle_edit(stage, path, options.variant))
 
 
 def _members(options: argparse.Namespace, side: str) -> Any:
@@ -201,6 +201,7 @@ def brush(session: Any, numbers: tuple[float, ...]) -> Any:
 
 def set_command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.authoring import named_edit, open_for_writing
+    from icheat_usd.errors import EditError
     from icheat_usd.session import authoring
 
     stage, layer = open_for_writing(options)
@@ -211,6 +212,8 @@ def set_command(options: argparse.Namespace) -> int:
     values |= _related(options)
     for side in ("receivers", "casters"):
         values[side] = _members(options, side)
+    if all(value is None for name, value in values.items() if name not in ("time", "variant")):
+        raise EditError(f"there is nothing to set on {edit}; give --set, --amount or another value")
     return _report(options, edit, layer, authoring.set_edit(stage, edit, layer=layer, **values))
 
 
@@ -255,13 +258,15 @@ def list_command(options: argparse.Namespace) -> int:
     if options.json:
         print_json({"stage": options.stage, "stack": path, "edits": [edit_as_json(edit) for edit in edits]})
         return 0
-    for edit in edits:
-        print(edit_summary(edit))
+    for line in aligned([edit_summary(edit) for edit in edits]):
+        print(line)
+    if path is None:
+        print(f"{options.stage} has no edit stack", file=sys.stderr)
     return 0
 
 
 def _report(options: argparse.Namespace, edit: str, layer: str, findings: tuple[Any, ...]) -> int:
-    """Say what was written; opinions that a stronger layer hides are findings."""
+    """Say what was written; opinions that a stronger layer hides, and what an edit still lacks, are findings."""
     if options.json:
         rows = [finding_as_json(finding) for finding in findings]
         print_json({"edit": edit, "layer": layer, "findings": rows})

@@ -20,10 +20,13 @@ from icheat_usd.cli.options import (
     add_stack,
     add_stage,
     add_variant,
+    add_why,
     assignment,
     finding_as_json,
     finding_as_text,
     print_json,
+    time_code,
+    why,
 )
 
 
@@ -55,10 +58,12 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     make.add_argument(
         "--sidecar", metavar="FILE", help="folder or .icheat.h5 file for the payload; default by the layer"
     )
-    make.add_argument("--why", default="", metavar="TEXT", help="kept with the payload's history")
+    add_why(make)
 
     copy = _verb(verbs, "copy", "let a key's payload hold at another frame too", copy_command, "time of the new key")
-    copy.add_argument("--from", dest="source", type=float, required=True, metavar="T", help="time of the key to copy")
+    copy.add_argument(
+        "--from", dest="source", type=time_code, required=True, metavar="T", help="time of the key to copy"
+    )
 
     _verb(verbs, "remove", "take a key out; the only key stays", remove_command, "time of the key")
     _verb(verbs, "list", "list the keys, and which layer decides them", list_command)
@@ -75,7 +80,7 @@ def _verb(
     if frame:
         add_layer(parser)
         add_variant(parser)
-        parser.add_argument("--frame", type=float, required=name != "set", metavar="T", help=frame)
+        parser.add_argument("--frame", type=time_code, required=name != "set", metavar="T", help=frame)
     add_json(parser)
     parser.set_defaults(command=command)
     return parser
@@ -100,7 +105,7 @@ def set_command(options: argparse.Namespace) -> int:
         return _report(options, edit, layer, findings)
     values: dict[str, Any] = {"layer": layer, "frame": options.frame, "parameters": dict(options.set or ())}
     values |= {"identity": options.identity, "interpolation": options.interpolation}
-    values |= {"sidecar": options.sidecar, "why": options.why, "variant": options.variant}
+    values |= {"sidecar": options.sidecar, "why": why(options), "variant": options.variant}
     if any(spheres.values()):
         # Painting needs the scene as it is at the key's frame; other keys work in a host without the kernels.
         from icheat_usd.cli.edit import brush

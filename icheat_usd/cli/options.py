@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -58,8 +59,19 @@ def why(options: argparse.Namespace) -> str:
     return options.why if options.why is not None else shlex.join(["icheat", *sys.argv[1:]])[:500]
 
 
-def add_frame(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--frame", type=float, metavar="T", help="time code; default the stage's first")
+def add_frame(parser: argparse.ArgumentParser, help: str = "time code; default the stage's first") -> None:
+    parser.add_argument("--frame", type=time_code, metavar="T", help=help)
+
+
+def time_code(text: str) -> float:
+    """A number; "nan", which USD takes for its default time, is none."""
+    try:
+        time = float(text)
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise argparse.ArgumentTypeError(f"'{text}' is no time code, such as 24 or 12.5")
+    return time
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -125,17 +137,23 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 
 def finding_as_json(finding: Any) -> dict[str, Any]:
-    return {key: str(value) for key, value in asdict(finding).items()}
+    return {key: str(value) for key, value in asdict(finding).items()} | {"severity": severity(finding)}
+
+
+def severity(finding: Any) -> str:
+    """What only some kinds of finding say; the others are warnings."""
+    return str(getattr(finding, "severity", "warning"))
 
 
 def finding_as_text(finding: Any) -> str:
-    severity = getattr(finding, "severity", "warning")
     place = " ".join(part for part in (finding.prim, finding.feature) if part)
-    return f"{severity}: {place}: {finding.message}"
+    return f"{severity(finding)}: {place}: {finding.message}"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows of cells as lines with columns; nothing follows the last cell of a row."""
+    if not rows:
+        return []
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 

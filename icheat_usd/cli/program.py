@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 import traceback
 from importlib import import_module
+from typing import Any, NoReturn
 
 from icheat_usd import __version__
 from icheat_usd.errors import IcheatError
@@ -42,9 +44,26 @@ CLEAN, FINDINGS, FAILURE, INTERRUPTED = 0, 1, 2, 130
 _EPILOG = "Exit status: 0 clean, 1 findings, 2 failure, 130 interrupted. `icheat VERB --help` tells more."
 
 
+class Parser(argparse.ArgumentParser):
+    """Parser of the program and of each verb: mistakes are one line, and numbers may begin with a minus."""
+
+    def __init__(self, *args: Any, **values: Any) -> None:
+        super().__init__(*args, **values)
+        # As in newer versions of argparse: "-1,0.5,2" is a value and no option.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
+
+    def error(self, message: str) -> NoReturn:
+        """End with one line; the usage of some verbs has twenty."""
+        raise UsageError(f"{self.prog}: error: {message}; `{self.prog} --help` tells more")
+
+
+class UsageError(SystemExit):
+    """The command line says something that the program does not know."""
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line; verbs import their libraries only when they run."""
-    parser = argparse.ArgumentParser(prog="icheat", description=__doc__, epilog=_EPILOG)
+    parser = Parser(prog="icheat", description=__doc__, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"icheat {__version__}")
     parser.add_argument("--traceback", action="store_true", help="show where in the program an error arose")
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
@@ -54,7 +73,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def add_verb(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, module: object) -> None:
+def add_verb(verbs: argparse._SubParsersAction[Any], name: str, module: object) -> None:
     doc = str(module.__doc__).strip()
     verb = verbs.add_parser(
         name,
@@ -69,9 +88,15 @@ def add_verb(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: s
 
 def run(arguments: list[str] | None = None) -> int:
     """Run one command line; every failure becomes one line on stderr and an exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        options = build_parser().parse_args(arguments)
-    except SystemExit as end:  # argparse: 0 after --help, 2 after a usage error
+        options = build_parser().parse_args(given)
+    except UsageError as error:
+        print(error, file=sys.stderr)
+        if "--json" in given:
+            print(json.dumps({"version": 1, "error": str(error)}))
+        return FAILURE
+    except SystemExit as end:  # --help, --version
         return int(end.code or 0)
     try:
         status = int(options.command(options))

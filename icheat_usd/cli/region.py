@@ -2,8 +2,6 @@
 
 icheat region add shot.usda Edits/window --box 0,1.5,-2,1,2,0.5 --softness 0.3
 icheat edit set shot.usda warmFace --receiver-limit Edits/window
-
-Numbers that begin with a minus need an equals sign: --box=-1,1.5,-2,1,2,0.5
 """
 
 from __future__ import annotations

@@ -83,13 +83,12 @@ def _payloads_as_json(how: str, states: Any) -> dict[str, Any]:
     return {"encoding": how, "stale": any(state.stale for state in states), "payloads": payloads}
 
 
-def edit_summary(edit: Any) -> str:
-    """One line: name, operation, parameters, amount, and what keeps it from acting."""
-    parts = [edit.path.rpartition("/")[2], str(edit.operation.value)]
-    parts += [f"{name}={_text(value.value)}" for name, value in sorted(edit.parameters.items()) if value.layer]
+def edit_summary(edit: Any) -> tuple[str, str, str]:
+    """Cells of one line: name; operation; parameters, amount, and what keeps it from acting."""
+    parts = [f"{name}={_text(value.value)}" for name, value in sorted(edit.parameters.items()) if value.layer]
     if edit.amount.value != 1.0:
         parts.append(f"amount={_text(edit.amount.value)}")
-    return "  ".join([*parts, *_notes(edit)])
+    return edit.path.rpartition("/")[2], str(edit.operation.value), "  ".join([*parts, *_notes(edit)])
 
 
 def _notes(edit: Any) -> list[str]:

@@ -18,7 +18,7 @@ from icheat_usd.scene import Finding
 from icheat_usd.session.origin import history_entry
 from icheat_usd.sidecar import read_payload as read_sidecar
 from icheat_usd.sidecar import write_payloads
-from icheat_usd.stage import authoring, collections
+from icheat_usd.stage import authoring, collections, schema
 from icheat_usd.stage.authoring import Members
 
 
@@ -99,6 +99,8 @@ def add_edit(
     parameters = parameters or {}
     written_to = authoring.find_layer(stage, layer)
     stack_path = stack or _default_stack(stage)
+    if not _is_known(operation):
+        raise authoring.unknown_operation(f"{stack_path}/{name}", operation)
     payload = Payload(
         operation=operation,
         parameters=dict(parameters),
@@ -153,6 +155,10 @@ def add_edit(
 
 def set_edit(stage: Any, edit: str, *, layer: str, **values: Any) -> tuple[Finding, ...]:
     """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`."""
+    operation = values.get("operation")
+    if operation is not None and operation != operations.BAKED and not _is_known(operation):
+        # A baked payload would go on acting as before, under a name that somebody misspelt.
+        raise authoring.unknown_operation(edit, operation)
     findings = authoring.set_edit(stage, edit, layer=layer, **values)
     _save(stage, layer)
     return findings
@@ -198,9 +204,19 @@ def surfaces_below(stage: Any, members: Members, paths: Iterable[str]) -> list[s
     return collections.surfaces_below(stage, members.includes, members.excludes, paths)
 
 
+def _is_known(operation: str) -> bool:
+    """Known here, or declared by a schema, for a host that can evaluate it."""
+    return operations.find(operation) is not None or operation in schema.operations()
+
+
 def _baked(operation: str, parameters: Mapping[str, Value], where: str) -> BakedConstants:
     known = operations.find(operation)
     return baked_constants(known, known.complete(parameters, where)) if known else {}
+
+
+def is_kept(stage: Any, layer: str) -> bool:
+    """Whether what is written to a layer outlives the stage: the session layer has no file."""
+    return not authoring.find_layer(stage, layer).anonymous
 
 
 def anchor_of(stage: Any) -> str:

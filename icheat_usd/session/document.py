@@ -12,7 +12,7 @@ from icheat_usd.edits.binding import bind
 from icheat_usd.edits.facts import facts
 from icheat_usd.edits.model import EMPTY_STACK, Blend, EditStack, SurfaceMask, Value
 from icheat_usd.edits.painting import Brush, paint_mask
-from icheat_usd.errors import StageError
+from icheat_usd.errors import EditError, StageError
 from icheat_usd.final_gather import GatherSettings, final_gather
 from icheat_usd.image.film import Film
 from icheat_usd.progress import Progress, silent
@@ -350,7 +350,7 @@ class Session:
             return None
         members = selected if isinstance(selected, Members) else Members(tuple(selected))
         paths = authoring.surfaces_below(self.stage, members, [s.path for s in self.snapshot.surfaces])
-        return paint_mask(self.snapshot, paths, brush)
+        return _painted(self, paths, brush)
 
     def set_key(
         self,
@@ -373,13 +373,16 @@ class Session:
             shot = self
             if frame is not None and self.frame != frame:
                 shot = Session.open(self.stage, camera=self.camera, frame=frame)
-            selected = next(found for found in self.stack.edits if found.path == edit)
+            selected = next((found for found in self.stack.edits if found.path == edit), None)
+            if selected is None:
+                paintable = ", ".join(found.path for found in self.stack.edits) or "none"
+                raise EditError(f"{edit} is no active edit of the stack {self.stack_path}; it has {paintable}")
             for side, selection, brush in (
                 ("receiver_mask", selected.receivers, receiver_brush),
                 ("caster_mask", selected.casters, caster_brush),
             ):
                 if brush is not None:
-                    values[side] = paint_mask(shot.snapshot, selection.paths, brush)
+                    values[side] = _painted(shot, selection.paths, brush)
             values["made_against"] = shot._made_against
         return keys.set_key(self.stage, edit, layer=layer, frame=frame, **values)
 
@@ -400,3 +403,10 @@ class Session:
     ) -> tuple[Finding, ...]:
         """Mute or unmute an edit in one layer and save it."""
         return authoring.mute_edit(self.stage, edit, layer=layer, muted=muted, variant=variant)
+
+
+def _painted(session: Session, paths: Sequence[str] | frozenset[str], brush: Brush) -> SurfaceMask:
+    mask = paint_mask(session.snapshot, paths, brush)
+    if not mask.texels.any():
+        raise EditError("the brush touches none of the surfaces that it should paint; move it or make it larger")
+    return mask

@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 from icheat_usd.scene import Finding
 from icheat_usd.session.authoring import read_payload
 from icheat_usd.stage import open_stage, schema
-from icheat_usd.stage.check import RULES, check_stage
+from icheat_usd.stage.check import RULES, Context, check_stage, findings_of
+from icheat_usd.stage.check.selections import EmptySelection, UnshadowWithoutOccluders
 from icheat_usd.stage.description import EditDescription, describe_edit
 from icheat_usd.stage.list_edits import Listing, listings
 from icheat_usd.stage.opening import composition_findings
 from icheat_usd.stage.refusals import named_refusals
-from icheat_usd.stage.stacks import find_stack, stack_prim, stack_prims
+from icheat_usd.stage.stacks import edit_prim, find_stack, stack_prim, stack_prims
+from icheat_usd.stage.variants import selected_variant
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,14 @@ def describe_stack(stage: Any, path: str, frame: float | None = None) -> StackDe
 def check(stage: Any, frame: float | None = None) -> tuple[Finding, ...]:
     """Everything wrong with a stage's composition and its edits; every payload is read."""
     return (*composition_findings(stage), *check_stage(stage, frame, read_payload))
+
+
+def idle_edit(stage: Any, edit: str, variant: tuple[str, str] | None = None) -> tuple[Finding, ...]:
+    """What an edit, maybe one of a variant, still lacks before it can do anything; no payload is read."""
+    rules = [rule for rule in RULES if isinstance(rule, (EmptySelection, UnshadowWithoutOccluders))]
+    with selected_variant(stage, edit, variant):
+        context = Context(stage, schema.default_time(stage, None), (), (edit_prim(stage, edit),), ())
+        return tuple(finding for rule in rules for finding in findings_of(rule, context))
 
 
 class RuleDescription(NamedTuple):

@@ -14,7 +14,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdGeom
 
 from icheat_usd.edits.model import Blend, Value
 from icheat_usd.errors import EditError
@@ -29,6 +29,7 @@ from icheat_usd.stage.layers import remember_layer as remember_layer
 from icheat_usd.stage.layers import save_layer as save_layer
 from icheat_usd.stage.layers import writing as writing
 from icheat_usd.stage.parameter_authoring import checked_blend, set_amount, set_operation, set_value
+from icheat_usd.stage.parameter_authoring import unknown_operation as unknown_operation
 from icheat_usd.stage.selection_authoring import Members as Members
 from icheat_usd.stage.selection_authoring import add_region as add_region
 from icheat_usd.stage.selection_authoring import add_selection as add_selection
@@ -72,6 +73,9 @@ def create_stack(stage: Usd.Stage, path: str, *, layer: str | Sdf.Layer, camera:
     if schema.has_schema(existing, schema.STACK_API):
         raise EditError(f"{stack_path} is a stack already; add edits to it or choose another path")
     cameras = collections.find_prims(stage, [camera], "camera") if camera is not None else ()
+    for target in cameras:
+        if not stage.GetPrimAtPath(target).IsA(UsdGeom.Camera):
+            raise EditError(f"{stack_path}: {target} is no camera; name one")
     with writing(stage, layer, stack_path):
         define_ancestors(stage, stack_path)
         prim = existing if existing and existing.IsDefined() else stage.DefinePrim(stack_path, "Scope")
@@ -144,10 +148,14 @@ def add_edit(
     if not Sdf.Path.IsValidIdentifier(name):
         raise EditError(f"'{name}' cannot name an edit; use letters, digits and underscores")
     path = prim.GetPath().AppendChild(name)
+    if {before, after} & {name, str(path)}:
+        raise EditError(f"{path} cannot lie before or after itself; name another edit")
     refuse_instances(stage, path)
     with writing(stage, layer, prim.GetPath(), variant) as written_to:
         if stage.GetPrimAtPath(path):
-            raise EditError(f"{path} exists already; choose another name or set its values")
+            is_listed = path in prim.GetRelationship(schema.EDITS).GetTargets()
+            choice = "or set its values" if is_listed else "as the stack does not list it: a layer took it out"
+            raise EditError(f"{path} exists already; choose another name {choice}")
         edit = stage.DefinePrim(path, "Scope")
         apply_schema(edit, schema.EDIT_API)
         set_operation(edit, operation, parameters or {}, time, has_payload=payload is not None)

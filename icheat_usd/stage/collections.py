@@ -139,8 +139,19 @@ def _find(stage: Usd.Stage, name: str, what: str) -> Sdf.Path:
         return path
     if stage.GetPrimAtPath(path.GetPrimPath()) and (path.IsPrimPath() or Usd.CollectionAPI.Get(stage, path)):
         return path
+    raise EditError(f"{what}: the stage {stage.GetRootLayer().identifier} has no prim {path}{_hint(stage, path)}")
+
+
+def _hint(stage: Usd.Stage, path: Sdf.Path) -> str:
+    """What may be meant: prims of the same name elsewhere, siblings of a similar name, or just the siblings."""
     known = [str(prim.GetPath()) for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())]
     close = [p for p in known if p.rpartition("/")[2] == path.name][:3]
-    close = close or difflib.get_close_matches(str(path), known, n=3)
-    hint = f"; did you mean {' or '.join(close)}?" if close else "; `usdtree` lists what there is"
-    raise EditError(f"{what}: the stage {stage.GetRootLayer().identifier} has no prim {path}{hint}")
+    first_missing = next(prefix for prefix in (*path.GetPrefixes(), path) if not stage.GetPrimAtPath(prefix))
+    parent = stage.GetPrimAtPath(first_missing.GetParentPath())
+    children = parent.GetFilteredChildrenNames(Usd.TraverseInstanceProxies())
+    near = difflib.get_close_matches(first_missing.name, children, n=3)
+    close = close or [str(parent.GetPath().AppendChild(name)) for name in near]
+    if close:
+        return f"; did you mean {' or '.join(close)}?"
+    listed = ", ".join(children[:12]) + (", …" if len(children) > 12 else "")
+    return f"; {parent.GetPath()} has {listed or 'nothing below it'}"

@@ -188,7 +188,8 @@ def key_at(prim: Usd.Prim, time: float) -> Key:
         if key.time is not None and abs(key.time - time) <= SAME_TIME:
             return key
     times = ", ".join(f"{known:g}" for known in track.times) if track else ""
-    raise EditError(f"{prim.GetPath()}: no key at {time:g}; it has {f'keys at {times}' if times else 'no keys'}")
+    held = "one payload for all times" if track and track.keys else "no keys"
+    raise EditError(f"{prim.GetPath()}: no key at {time:g}; it has {f'keys at {times}' if times else held}")
 
 
 def _check_interpolation(edit: str, interpolation: str | None) -> None:
@@ -259,6 +260,7 @@ def copied_keys_are_current(prim: Usd.Prim) -> tuple[str, bool] | None:
 
 def write_key(prim: Usd.Prim, layer: Sdf.Layer, time: float | None, asset: str | None, digest: str) -> None:
     """Author one key in the layer that the stage writes to; no asset is the identity."""
+    when = schema.time_to_write(time)
     for name, value in ((schema.FILE_PATH, asset and Sdf.AssetPath(asset)), (schema.PAYLOAD, digest)):
         attribute = prim.GetAttribute(name)
         if time is None:
@@ -266,7 +268,7 @@ def write_key(prim: Usd.Prim, layer: Sdf.Layer, time: float | None, asset: str |
             continue
         stage_time = float(time)
         _erase_sample(prim, layer, name, stage_time)
-        attribute.Set(value if asset else Sdf.ValueBlock(), Usd.TimeCode(stage_time))
+        attribute.Set(value if asset else Sdf.ValueBlock(), when)
 
 
 def _erase_sample(prim: Usd.Prim, layer: Sdf.Layer, name: str, stage_time: float) -> None:

@@ -44,7 +44,7 @@ def find_layer(stage: Usd.Stage, layer: str | Sdf.Layer) -> Sdf.Layer:
         matches = matches or [candidate for candidate in layers if _file_name(candidate) == layer]
     name = layer.identifier if isinstance(layer, Sdf.Layer) else layer
     if len(matches) != 1:
-        known = ", ".join(candidate.identifier for candidate in layers)
+        known = ", ".join(candidate.identifier for candidate in layers if not candidate.anonymous)
         count = "is not" if not matches else f"matches {len(matches)} layers"
         raise EditError(
             f"layer '{name}' {count} in the layer stack of {stage.GetRootLayer().identifier}, which has {known}; "

@@ -18,7 +18,7 @@ from icheat_usd.stage.selection_authoring import apply_schema
 def set_value(prim: Usd.Prim, name: str, value: Any, time: float | None = None) -> None:
     """Author a value, without a time the default."""
     attribute = prim.GetAttribute(name)
-    attribute.Set(value, Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
+    attribute.Set(value, schema.time_to_write(time))
 
 
 def set_amount(prim: Usd.Prim, amount: float, time: float | None) -> None:
@@ -56,13 +56,9 @@ def set_operation(
     EditError
         The operation or a parameter is unknown, or a value does not fit.
     """
-    known = schema.operations()
-    found = known.get(operation)
+    found = schema.operations().get(operation)
     if found is None and (parameters or not has_payload):
-        raise EditError(
-            f"{prim.GetPath()}: no operation is called '{operation}'; there are {', '.join(sorted(known))} "
-            f"(another one needs its schema on PXR_PLUGINPATH_NAME, or a baked payload and no parameters)"
-        )
+        raise unknown_operation(str(prim.GetPath()), operation)
     written = [schema.OPERATION] if write_token else []
     if write_token:
         set_value(prim, schema.OPERATION, operation)
@@ -81,6 +77,14 @@ def set_operation(
         set_value(prim, found.parameters[name].name, value, time)
         written.append(found.parameters[name].name)
     return written
+
+
+def unknown_operation(edit: str, operation: str) -> EditError:
+    """What to say about an operation that nobody knows."""
+    return EditError(
+        f"{edit}: no operation is called '{operation}'; there are {', '.join(sorted(schema.operations()))} "
+        f"(another one needs its schema on PXR_PLUGINPATH_NAME, or a baked payload and no parameters)"
+    )
 
 
 def _check_together(

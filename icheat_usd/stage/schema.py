@@ -8,6 +8,7 @@ instead, so that such a host sees the same edits; it only cannot author them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -74,6 +75,19 @@ class OperationSchema:
 def time_code(time: float | None) -> Usd.TimeCode:
     """The time code to read at: without a time the earliest, as an attribute may have time samples alone."""
     return Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
+
+
+def time_to_write(time: float | None) -> Usd.TimeCode:
+    """The time code to author at, without a time the default.
+
+    Raises
+    ------
+    EditError
+        It is not finite: USD would author the default for "nan", which nobody meant.
+    """
+    if time is not None and not math.isfinite(time):
+        raise EditError(f"{time} is no time to author at; give a number such as 24 or 12.5")
+    return Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
 
 
 def default_time(stage: Usd.Stage, time: float | None) -> float | None:

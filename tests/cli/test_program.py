@@ -61,7 +61,21 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize("arguments", [[], ["nonsense"], ["relight", "a.usda"], ["edit"], ["render", "a.usda", "-o"]])
 def test_a_usage_error_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
-    assert "usage: icheat" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert error.startswith("icheat") and "--help` tells more" in error and error.count("\n") == 1
+
+
+def test_a_usage_error_is_json_too_where_json_was_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tree", "a.usda", "--bogus", "--json"]) == 2
+    output = capsys.readouterr()
+    assert json.loads(output.out) == {"version": 1, "error": output.err.strip()} and "--bogus" in output.err
+
+
+def test_values_may_begin_with_a_minus() -> None:
+    parser = build_parser()
+    region = parser.parse_args(["region", "add", "a.usda", "R", "--sphere", "-1,.5,-2,1"])
+    edit = parser.parse_args(["edit", "add", "a.usda", "E", "--caster-sphere", "-.5,0,0,1,2", "--amount", "-1"])
+    assert region.sphere == (-1, 0.5, -2, 1) and edit.caster_sphere == (-0.5, 0, 0, 1, 2) and edit.amount == -1
 
 
 def fails_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:

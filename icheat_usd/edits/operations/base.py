@@ -165,7 +165,8 @@ class Operation(ABC):
         known = {parameter.name: parameter for parameter in self.parameters}
         for name in given:
             if name not in known:
-                raise EditError(f"{where}: operation '{self.name}' has no parameter '{name}'; it has {sorted(known)}")
+                listed = ", ".join(sorted(known))
+                raise EditError(f"{where}: operation '{self.name}' has no parameter '{name}'; it has {listed}")
         return {name: _checked(given.get(name, p.default), p, where) for name, p in known.items()}
 
 

@@ -23,8 +23,21 @@ class EmptySelection(Rule):
     def find(self, context: Context) -> Found:
         for prim in context.edits:
             for name in (schema.RECEIVERS, schema.CASTERS):
-                if collections.collection(prim, name).HasNoIncludedPaths():
+                selected = collections.collection(prim, name)
+                if selected.HasNoIncludedPaths():
                     yield prim, name, "selects nothing, so the edit does nothing; include prims"
+                    continue
+                expression = collections.authored(prim, name)[2]
+                if expression and not _matches_anything(prim, name):
+                    yield prim, name, f"no prim matches '{expression}', so the edit does nothing; change the expression"
+
+
+def _matches_anything(edit: Usd.Prim, name: str) -> bool:
+    everything = Usd.PrimRange(edit.GetStage().GetPseudoRoot(), Usd.TraverseInstanceProxies())
+    try:
+        return bool(collections.select(edit, name, (str(prim.GetPath()) for prim in everything)).paths)
+    except EditError:
+        return True  # What USD cannot evaluate is named where the edits are read.
 
 
 class SelectedPrimMissing(Rule):

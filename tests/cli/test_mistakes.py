@@ -1,0 +1,116 @@
+"""Mistakes of the people who type: none may pass for success, and none may change a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from icheat_usd.cli import main
+
+STAGE = """#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+def Xform "World"
+{
+    def Sphere "Ball" {}
+    def Sphere "Wall" {}
+    def Camera "Camera" {}
+}
+"""
+
+SELECTED = ("--receivers", "Ball", "--casters", "Wall")
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    path = tmp_path / "shot.usda"
+    path.write_text(STAGE)
+    assert main(["edit", "add", str(path), "warm", *SELECTED, "--set", "gain=2"]) == 0
+    return path
+
+
+def files(folder: Path) -> Mapping[str, bytes]:
+    return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("edit add SHOT new --operation sale", "no operation is called 'sale'; there are albedo"),
+        ("edit set SHOT warm --operation sale", "no operation is called 'sale'; there are albedo"),
+        ("edit set SHOT warm", "there is nothing to set on /World/Edits/warm"),
+        ("edit set SHOT warm --frame 10", "there is nothing to set on /World/Edits/warm"),
+        ("edit set SHOT warm --layer session --amount 0.5", "layer 'session' has no file"),
+        ("edit add SHOT new --layer session", "layer 'session' has no file"),
+        ("region add SHOT R --sphere 0,0,0,1 --layer session", "layer 'session' has no file"),
+        ("edit set SHOT warm --layer no.usda --amount 0.5", "no.usda' is not in the layer stack"),
+        ("edit set SHOT warm --frame nan --amount 0.5", "'nan' is no time code"),
+        ("key set SHOT warm --frame inf", "'inf' is no time code"),
+        ("key copy SHOT warm --from nan --frame 3", "'nan' is no time code"),
+        ("key remove SHOT warm --frame 3", "no key at 3; it has one payload for all times"),
+        ("edit add SHOT new --set gian=2", "has no parameter 'gian'; it has color, gain"),
+        ("edit add SHOT new --before new", "new cannot lie before or after itself"),
+        ("edit add SHOT new --receivers Bal", "no prim /World/Bal; did you mean /World/Ball?"),
+        ("edit add SHOT new --receivers Xyz/Deep", "no prim /World/Xyz/Deep; /World has Ball, Wall, Camera, Edits"),
+        ("stack create SHOT Other --camera Ball", "/World/Ball is no camera"),
+        ("edit add SHOT new --receivers Ball --receiver-sphere 90,0,0,1,2", "the brush touches none of the surfaces"),
+        ("key set SHOT warm --frame 3 --receiver-sphere 90,0,0,1,2", "the brush touches none of the surfaces"),
+    ],
+)
+def test_a_mistake_is_one_line_and_changes_nothing(
+    words: str, message: str, shot: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files(shot.parent)
+    capsys.readouterr()
+    assert main([*words.replace("SHOT", str(shot)).split(), "--json"]) == 2
+    output = capsys.readouterr()
+    assert message in output.err and output.err.count("\n") == 1
+    assert json.loads(output.out) == {"version": 1, "error": output.err.strip().removeprefix("icheat: error: ")}
+    assert files(shot.parent) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--casters", "Wall"), "icheatReceivers: selects nothing"),
+        (("--receivers", "Ball", "--casters-expression", "//Props//*"), "icheatCasters: no prim matches '"),
+        ((*SELECTED, "--operation", "unshadow"), "occluders"),
+    ],
+)
+def test_what_a_new_edit_lacks_is_said_at_once(
+    words: tuple[str, ...], message: str, shot: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["edit", "add", str(shot), "new", *words]) == 1
+    assert message in capsys.readouterr().err
+    assert main(["edit", "remove", str(shot), "new"]) == 0
+    assert main(["check", str(shot)]) == 0
+
+
+def test_an_edit_that_a_layer_took_out_is_named_as_such(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    over = shot.parent / "over.usda"
+    over.write_text('#usda 1.0\n(\n    defaultPrim = "World"\n    subLayers = [@./shot.usda@]\n)\n')
+    assert main(["edit", "remove", str(over), "warm"]) == 0
+    assert main(["edit", "add", str(over), "warm", *SELECTED]) == 2
+    assert "exists already; choose another name as the stack does not list it" in capsys.readouterr().err
+
+
+def test_edits_are_listed_in_columns(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["edit", "add", str(shot), "muchLonger", "--operation", "hsv", *SELECTED, "--set", "hue=20"]) == 0
+    capsys.readouterr()
+    assert main(["edit", "list", str(shot)]) == 0
+    assert capsys.readouterr().out == "warm        scale  gain=2\nmuchLonger  hsv    hue=20\n"
+
+
+def test_keys_say_why_by_default_as_edits_do(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["key", "set", str(shot), "warm", "--frame", "3", "--set", "gain=4", "--why", "hotter"]) == 0
+    assert main(["key", "set", str(shot), "warm", "--frame", "5", "--set", "gain=5"]) == 0
+    capsys.readouterr()
+    assert main(["history", str(shot), "warm", "--json"]) == 0
+    whys = [event["why"] for event in json.loads(capsys.readouterr().out)["events"]]
+    assert "hotter" in whys and any(why.startswith("icheat ") for why in whys)
