@@ -50,7 +50,8 @@ $(VENV)/.oldest-usd: pyproject.toml | $(VENV)/.installed-dev
 	@touch $@
 
 test-oldest-usd: $(VENV)/.oldest-usd
-	PYTHONPATH=$(CURDIR)/$(VENV)/oldest-usd $(BIN)/python -m pytest $(PYTEST_ARGS) tests/stage tests/cli/test_program.py
+	PYTHONPATH=$(CURDIR)/$(VENV)/oldest-usd $(BIN)/python -m pytest $(PYTEST_ARGS) tests/stage \
+		tests/composition tests/session/test_keys.py tests/cli/test_program.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis demo_output

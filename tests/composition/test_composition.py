@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pxr import Sdf, Ts, Usd
 
 from icheat_usd.errors import SidecarError
 from tests.composition import cases_in_time, cases_of_arcs, cases_of_layers, cases_of_variants
@@ -51,8 +52,19 @@ def test_a_scaled_layer_offset_moves_all_times(case: Case, written: dict[str, An
         assert moved["edits"] == read_case(flat)["edits"]
 
 
+def flattening_keeps_splines() -> bool:
+    stage = Usd.Stage.CreateInMemory()
+    attribute = stage.DefinePrim("/prim").CreateAttribute("value", Sdf.ValueTypeNames.Float)
+    spline = Ts.Spline("float")
+    spline.SetKnot(Ts.Knot("float", time=1.0, value=2.0))
+    attribute.SetSpline(spline)
+    return bool(stage.Flatten().GetAttributeAtPath("/prim.value").HasInfo("spline"))
+
+
 def test_what_usd_flattens_means_the_same(case: Case, written: dict[str, Any]) -> None:
     composed = written[case.name][0]
+    if "spline" in case.name and not flattening_keeps_splines():
+        pytest.skip("this USD drops splines when it flattens")
     flattened = Path(composed["root"]).with_name("flattened.usda")
     open_case(composed).Flatten().Export(str(flattened))
     read = read_case(composed | {"root": str(flattened), "session": "", "muted": []})

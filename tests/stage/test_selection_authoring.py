@@ -95,7 +95,7 @@ def test_what_a_stronger_layer_decides_is_a_finding(stage: Usd.Stage) -> None:
         ({"lights": ["/World/indirect.collection:x"]}, "has no prim /World/indirect.collection:x"),
         ({"target": f"{EDIT}.collection:icheatCasters"}, "icheat:target: expected prims, got"),
         ({"lights": "lamp"}, "expected a list of paths, got the text 'lamp'"),
-        ({"receivers": Members(expression="//{isa:Mesh")}, "is no membership expression .Ill-formed path expression"),
+        ({"receivers": Members(expression="//{isa:Mesh")}, "is no membership expression \\("),
         ({"receivers": Members(("floor",), (), "//*")}, "takes the place of paths; give one or the other"),
     ],
 )
