@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from icheat_usd.edits import operations
+from icheat_usd.edits.encodings.rows import bind_rows
 from icheat_usd.edits.field import BoundEdit, EditField
 from icheat_usd.edits.measures import Measures
 from icheat_usd.edits.model import Edit, EditStack, Payload, Selection, Value
@@ -71,8 +72,8 @@ def _bind_edit(edit: Edit, snapshot: SceneSnapshot, groups: Bool | None) -> Boun
         payloads = [(key.payload, key.weight) for key in edit.keys if key.payload is not None]
     rows, baked = [], []
     for payload, _ in payloads:
-        use_rows = operation is None and payload is not None and payload.rows is not None
-        rows.append(_bind_rows(payload, snapshot, edit.path) if use_rows and payload is not None else None)
+        sampled = None if operation is not None or payload is None else payload.rows
+        rows.append(None if sampled is None else bind_rows(sampled, snapshot, edit.path))
         baked.append(_constants(payload) if operation is None and rows[-1] is None else None)
         if operation is None and rows[-1] is None and baked[-1] is None:
             raise EditError(
@@ -109,13 +110,6 @@ def _bind_edit(edit: Edit, snapshot: SceneSnapshot, groups: Bool | None) -> Boun
 
 def _masks(payload: Payload | None) -> tuple[Any, Any]:
     return (None, None) if payload is None else (payload.receiver_mask, payload.caster_mask)
-
-
-def _bind_rows(payload: Payload, snapshot: SceneSnapshot, where: str) -> Any:
-    from icheat_usd.edits.encodings.rows import bind_rows
-
-    assert payload.rows is not None
-    return bind_rows(payload.rows, snapshot, where)
 
 
 def _constants(payload: Payload | None) -> PairCoefficients | None:

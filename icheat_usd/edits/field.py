@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icheat_usd.edits.encodings.rows import BoundRows
 from icheat_usd.edits.model import Blend, Edit, Value
 from icheat_usd.edits.operations import Level, Operation, PairCoefficients, PairEnd, Pairs
 from icheat_usd.edits.operations.division import divide
@@ -81,7 +82,7 @@ class BoundEdit:
     operation: Operation | None  #: None: unknown here, what is baked is used
     parameters: tuple[Mapping[str, Value], ...]
     baked: tuple[PairCoefficients | None, ...]  #: used where the operation is unknown and there are no rows
-    rows: tuple[Any | None, ...]  #: BoundRows, used where the operation is unknown
+    rows: tuple[BoundRows | None, ...]  #: used where the operation is unknown
     receivers: tuple[BoundSelection, ...]
     casters: tuple[BoundSelection, ...]
     key_weights: tuple[float, ...]
@@ -107,9 +108,9 @@ class BoundEdit:
         """
         if self.operation is not None:
             return self.operation.evaluate(self.parameters[key], pairs)
-        if self.rows[key] is not None:
-            result: PairCoefficients = self.rows[key].evaluate(receivers, casters)  # type: ignore[union-attr]
-            return result
+        rows = self.rows[key]
+        if rows is not None:
+            return rows.evaluate(receivers, casters)
         baked = self.baked[key]
         assert baked is not None
         return baked

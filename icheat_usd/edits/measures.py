@@ -9,6 +9,7 @@ import numpy as np
 from icheat_usd.edits.selection import BoundSelection
 from icheat_usd.kernels import samples as kernels
 from icheat_usd.materials import points_on_surface
+from icheat_usd.samples import instance_areas
 from icheat_usd.scene import F64, I64, SceneSnapshot
 
 #: Places at which a selection is looked at, where it is not the same all over its surfaces.
@@ -51,24 +52,14 @@ class Measures:
         Surfaces count once: a wall that shines on one side has the mean radiance of that side.
         """
         if self.casters.constant_on_instances:
-            return float(_instance_areas(self.snapshot) @ self.casters.on_instances)
+            return float(instance_areas(self.snapshot) @ self.casters.on_instances)
         _, weight = _weighted_places(self.snapshot, self.casters, _N_PLACES)
         return float(weight.sum())
 
 
-def _instance_areas(snapshot: SceneSnapshot) -> F64:
-    """World area of each instance, one side, square metres."""
-    geometry = snapshot.geometry
-    area = np.zeros(snapshot.n_instances, np.float64)
-    kernels.instance_areas(
-        geometry.points, geometry.mesh_begin, geometry.instance_mesh, geometry.instance_to_world, area
-    )
-    return area
-
-
 def _weighted_places(snapshot: SceneSnapshot, selection: BoundSelection, n: int) -> tuple[F64, F64]:
     """About n places (n, 3) spread over the surfaces that may be selected, and the selected area of each (n,)."""
-    area = _instance_areas(snapshot)
+    area = instance_areas(snapshot)
     instances = np.flatnonzero((selection.on_instances > 0) & (area > 0))
     if not len(instances):
         return np.zeros((0, 3)), np.zeros(0)

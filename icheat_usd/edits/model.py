@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from icheat_usd.edits.encodings.rows import SampledRows
+    from icheat_usd.edits.encodings.sampled import SampledRows
 
 #: A parameter value: number, flag, token, or colour / vector as a tuple of floats.
 Value = float | bool | str | tuple[float, ...]

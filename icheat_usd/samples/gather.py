@@ -95,11 +95,7 @@ def gather_samples(
     """
     if n < 1:
         raise ValueError(f"a gather set needs at least one sample, not {n}")
-    geometry = snapshot.geometry
-    area = np.zeros(snapshot.n_instances, np.float64)
-    kernels.instance_areas(
-        geometry.points, geometry.mesh_begin, geometry.instance_mesh, geometry.instance_to_world, area
-    )
+    area = instance_areas(snapshot)
     if not np.any(area > 0):
         raise ValueError("no surface of the scene has an area, so nothing can reflect light")
     slots = _share_out(snapshot, area, _pilot(snapshot, tracer, view, seed), n)
@@ -270,6 +266,16 @@ def _name(snapshot: SceneSnapshot, side: int) -> tuple[str, ...]:
     surface = snapshot.surfaces[snapshot.geometry.instance_surface[instance]]
     prims = surface.path.strip("/").split("/")
     return (*prims, f"#{surface.instance_id + 1:010d}", surface.part, f"{instance:010d}", str(int(side) % 2))
+
+
+def instance_areas(snapshot: SceneSnapshot) -> F64:
+    """World area of each instance, one side, square metres."""
+    geometry = snapshot.geometry
+    area = np.zeros(snapshot.n_instances, np.float64)
+    kernels.instance_areas(
+        geometry.points, geometry.mesh_begin, geometry.instance_mesh, geometry.instance_to_world, area
+    )
+    return area
 
 
 def _spread(snapshot: SceneSnapshot, area: F64, slots: _Slots, count: I64, seed: int, stream: int) -> SurfacePoints:

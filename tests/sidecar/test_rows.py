@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.encodings.bake import at_full_amount, bake_field
-from icheat_usd.edits.encodings.rows import SampledRows, bind_rows
+from icheat_usd.edits.encodings.rows import bind_rows
+from icheat_usd.edits.encodings.sampled import SampledRows
 from icheat_usd.edits.model import Edit, Payload, Selection
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar import Element, list_elements, read_payload, write_payloads

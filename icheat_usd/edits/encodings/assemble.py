@@ -11,9 +11,8 @@ from icheat_usd.edits.encodings.pair_samples import PairSamples
 from icheat_usd.edits.encodings.places import make_places, masked_surface, object_positions
 from icheat_usd.edits.encodings.sampled import SampledRows, cell_begins, contract, needed_nodes
 from icheat_usd.edits.encodings.sites import ChosenSites
-from icheat_usd.kernels.samples import instance_areas
 from icheat_usd.materials import take_points
-from icheat_usd.samples import ClusterTree, GatherSamples
+from icheat_usd.samples import ClusterTree, GatherSamples, instance_areas
 from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot
 
 
@@ -26,9 +25,7 @@ class _Sides(NamedTuple):
 def _sides(gather: GatherSamples, snapshot: SceneSnapshot, leaves: Bool) -> _Sides:
     """Sides of surfaces that have leaves among those that are kept, and which."""
     table = gather.locator.table
-    geometry = snapshot.geometry
-    area = np.zeros(snapshot.n_instances, np.float64)
-    instance_areas(geometry.points, geometry.mesh_begin, geometry.instance_mesh, geometry.instance_to_world, area)
+    area = instance_areas(snapshot)
     before = np.concatenate([[0], np.cumsum(leaves)])
     begin = before[table.slot_begin]
     side = np.flatnonzero((np.diff(begin) > 0)[table.slot] & np.repeat(area > 0, 2))

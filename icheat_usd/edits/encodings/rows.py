@@ -11,12 +11,10 @@ from icheat_usd.edits.encodings.places import find_places, instance_scale, insta
 from icheat_usd.edits.encodings.sampled import SampledRows, cell_begins, contract, needed_nodes, tree_shape
 from icheat_usd.edits.operations import PairCoefficients
 from icheat_usd.kernels import row_coding, row_sites
-from icheat_usd.kernels.samples import instance_areas
+from icheat_usd.samples import instance_areas
 from icheat_usd.samples.locate import Locator, build_locator
 from icheat_usd.samples.tree import ClusterTree
 from icheat_usd.scene import F32, F64, I32, I64, Finding, SceneSnapshot, SurfacePoints
-
-__all__ = ["BoundRows", "Mixture", "SampledRows", "bind_rows"]
 
 #: How far apart a turn of the normal by one radian puts two sites, in mean reaches: across an edge of a mesh is far.
 NORMAL_REACH = 0.7
@@ -225,9 +223,7 @@ def _leaf_locator(rows: SampledRows, points: SurfacePoints, snapshot: SceneSnaps
     here = instance >= 0
     side = 2 * instance[here].astype(np.int64) + rows.side[here]
     on_side[side] = group_of_side.reshape(-1)[here]
-    geometry = snapshot.geometry
-    area = np.zeros(snapshot.n_instances, np.float64)
-    instance_areas(geometry.points, geometry.mesh_begin, geometry.instance_mesh, geometry.instance_to_world, area)
+    area = instance_areas(snapshot)
     group_area = np.bincount(on_side[side], area[instance[here]], len(ranges)).astype(np.float64)
     shape = tree_shape(rows.split_size, rows.n_leaves)
     node_of = {(int(a), int(b)): i for i, (a, b) in enumerate(zip(shape.lo, shape.hi, strict=True))}
