@@ -58,7 +58,8 @@ def flattening_keeps_splines() -> bool:
     spline = Ts.Spline("float")
     spline.SetKnot(Ts.Knot("float", time=1.0, value=2.0))
     attribute.SetSpline(spline)
-    return bool(stage.Flatten().GetAttributeAtPath("/prim.value").HasInfo("spline"))
+    layer = stage.Flatten()
+    return bool(layer.GetAttributeAtPath("/prim.value").HasInfo("spline"))
 
 
 def test_what_usd_flattens_means_the_same(case: Case, written: dict[str, Any]) -> None:
