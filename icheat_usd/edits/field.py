@@ -127,8 +127,8 @@ class EditField:
 
     Use: `receivers` and `casters` once for all points, `Ends.take` to form
     pairs, `evaluate` on these. Where `aggregates` has entries, each is resolved
-    in turn from the light of its casters under the edits before its `upto`; its
-    scales are then given to `evaluate`. `finish` applies what acts on views.
+    in turn from the light of its casters under the edits before its `upto`;
+    what it came to is then given to `evaluate`. `finish` applies what acts on views.
     """
 
     edits: tuple[BoundEdit, ...]
@@ -234,7 +234,7 @@ class EditField:
         b: F32,
         receivers: Ends,
         casters: Ends,
-        resolved: Sequence[F32] = (),
+        resolved: Sequence[PairCoefficients] = (),
         upto: int | None = None,
     ) -> StackCoefficients:
         """Compose the stack at n pairs (DESIGN, Semantics).
@@ -245,8 +245,8 @@ class EditField:
             Unedited light that the casters send, by group of lights.
         receivers : Ends of n points, or of 1 that all pairs share
         casters : Ends of n points
-        resolved : sequence of (n, 3) or (1, 3) float32
-            Scale of each resolved aggregate at the pairs' receivers, in the order of `aggregates`.
+        resolved : sequence of PairCoefficients
+            Those of each resolved aggregate at the pairs' receivers, in the order of `aggregates`.
         upto : int, optional
             Compose only the edits before this one.
 
@@ -269,16 +269,16 @@ class EditField:
             located += sum(rows_of_key is not None for rows_of_key in bound.rows)
             if bound.level is Level.VIEW:
                 continue
-            scales: Sequence[F32] = ()
+            found: Sequence[PairCoefficients] = ()
             if bound.level is Level.AGGREGATE:
-                scales = resolved[n_resolved : n_resolved + bound.n_keys]
+                found = resolved[n_resolved : n_resolved + bound.n_keys]
                 n_resolved += bound.n_keys
             weights = _pair_weights(bound, rows, receivers, casters, first_located)
             touched = np.flatnonzero(np.any([w != 0 for w in weights], axis=0))
             if len(touched) == 0:
                 continue
             self._apply(
-                state, bound, b, receivers, casters, weights, touched, scales, first_located, throughs.get(index)
+                state, bound, b, receivers, casters, weights, touched, found, first_located, throughs.get(index)
             )
         return StackCoefficients(
             state.scale, state.emission, state.offsets[0], state.offsets[1], tuple(state.offsets[2:])
@@ -293,7 +293,7 @@ class EditField:
         casters: Ends,
         weights: list[F32],
         touched: I64,
-        resolved: Sequence[F32],
+        resolved: Sequence[PairCoefficients],
         first_located: int,
         through_slot: int | None,
     ) -> None:
@@ -310,8 +310,9 @@ class EditField:
         for key in range(bound.n_keys):
             weight = weights[key][which, None]
             if bound.level is Level.AGGREGATE:
-                scale = resolved[key]
-                coefficients = PairCoefficients(scale if len(scale) == 1 else scale[which])
+                coefficients = resolved[key]
+                if len(coefficients.scale) > 1:
+                    coefficients = of_receivers(coefficients, which)
             else:
                 at = (None, None)
                 if bound.rows[key] is not None:
@@ -364,7 +365,7 @@ class EditField:
         Returns
         -------
         scale, added : (n, 3) float32
-            The light becomes ``scale light + added``; `added` is what no bounded scale can reach.
+            The light becomes ``scale light + added``; `added` is what no bounded scale can reach: see `sent_anew`.
         """
         bound = self.edits[aggregate.edit]
         assert bound.operation is not None
@@ -382,12 +383,6 @@ class EditField:
         bound = self.edits[aggregate.edit]
         mask = casters.masks[aggregate.row]
         return (bound.groups[:, None].astype(np.float32) * mask[None, :])[:, :, None]
-
-    def aggregate_weight(self, aggregate: Aggregate, receivers: Ends) -> F32:
-        """Factor on `added` of `resolve` at the receivers, (n, 1)."""
-        bound = self.edits[aggregate.edit]
-        share = np.float32(bound.edit.amount * bound.key_weights[aggregate.key])
-        return (share * receivers.masks[aggregate.row])[:, None]
 
     def finish(self, light: F32, receivers: Ends) -> F32:
         """Apply what acts on views to (n, 3) edited indirect light, then clamp it at zero."""
@@ -414,6 +409,30 @@ class EditField:
             offset = carried * offset + added
         # Once, at the end: a weaker edit's negative light may be lifted by a stronger one.
         return np.maximum(light if scale is None else scale * light + offset, np.float32(0))
+
+
+def sent_anew(scale: F32, added: F32, reach: F32) -> PairCoefficients:
+    """What pairs need so that the light of an aggregate's casters becomes ``scale light + added``.
+
+    What is added is light that the casters send, all of them the same radiance, so that stronger edits find it. From
+    casters that do not reach a receiver, or that it does not reflect, none can come.
+
+    Parameters
+    ----------
+    scale, added : (n, 3) float32
+        From `EditField.resolve`.
+    reach : (n, 3) float32
+        Transport from the casters, weighted by their masks.
+    """
+    reached = reach > 0
+    emission = np.divide(added, reach, out=np.zeros_like(added), where=reached)
+    return PairCoefficients(scale, np.minimum(emission, np.float32(1e30)))
+
+
+def of_receivers(coefficients: PairCoefficients, which: Any) -> PairCoefficients:
+    """A resolved aggregate at some receivers."""
+    emission = coefficients.emission
+    return PairCoefficients(coefficients.scale[which], None if emission is None else emission[which])
 
 
 @dataclass(eq=False)

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.edits.field import Aggregate, EditField, Ends
-from icheat_usd.edits.operations import Level, Operation
+from icheat_usd.edits.field import Aggregate, EditField, Ends, of_receivers
+from icheat_usd.edits.operations import Level, Operation, PairCoefficients
 from icheat_usd.scene import F32, F64, I64, Bool
 
 #: Pairs evaluated at once; bounds memory and keeps the arrays of a step near the caches.
@@ -77,7 +77,7 @@ def offset_radiance(
     casters: OffsetCasters,
     receivers: Ends,
     albedo: F32,
-    resolved: Sequence[F32] = (),
+    resolved: Sequence[PairCoefficients] = (),
     upto: int | None = None,
     aggregate: Aggregate | None = None,
 ) -> F32:
@@ -87,7 +87,7 @@ def offset_radiance(
     ----------
     receivers : Ends of n points
     albedo : (n, 3) float32, diffuse albedo of the receivers
-    resolved : scales (n, 3) of the aggregates
+    resolved : what each aggregate came to, at the receivers
     upto : compose only the edits before this one
     aggregate : count only what this aggregate looks at
 
@@ -142,7 +142,7 @@ def offset_sums(
     casters: OffsetCasters,
     receivers: Ends,
     which: I64,
-    resolved: Sequence[F32] = (),
+    resolved: Sequence[PairCoefficients] = (),
     upto: int | None = None,
     aggregate: Aggregate | None = None,
 ) -> tuple[F64, F64]:
@@ -153,13 +153,13 @@ def offset_sums(
         counted = field.aggregate_share(aggregate, casters.ends) * counted
     if len(which) == 1:
         ends, b, here = casters.ends, casters.b, receivers.take(which)
-        scales = [scale[which] for scale in resolved]
+        at_receivers = [of_receivers(found, which) for found in resolved]
     else:
         j = np.tile(np.arange(n_casters), len(which))
         i = np.repeat(which, n_casters)
         ends, b, here = casters.ends.take(j), np.take(casters.b, j, axis=1), receivers.take(i)
-        scales = [np.take(scale, i, axis=0) for scale in resolved]
-    coefficients = field.evaluate(b, here, ends, scales, upto)
+        at_receivers = [of_receivers(found, i) for found in resolved]
+    coefficients = field.evaluate(b, here, ends, at_receivers, upto)
     found = []
     for offset in (coefficients.offset_diffuse, coefficients.offset_paint):
         total = np.zeros((len(which), 3))

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.edits.field import Aggregate, EditField, Ends, StackCoefficients, weighted
+from icheat_usd.edits.field import Aggregate, EditField, Ends, StackCoefficients, of_receivers, sent_anew, weighted
 from icheat_usd.edits.offsets import PAIRS_AT_ONCE, OffsetCasters, offset_radiance
+from icheat_usd.edits.operations import PairCoefficients
 from icheat_usd.scene import F32, I64
 
 
@@ -75,11 +76,11 @@ def edited_light(
     """
     n = receivers.masks.shape[1]
 
-    def total(resolved: Sequence[F32], upto: int | None = None, aggregate: Aggregate | None = None) -> F32:
+    def total(resolved: Sequence[PairCoefficients], upto: int | None = None, aggregate: Aggregate | None = None) -> F32:
         light = np.zeros((n, 3))
         for block in blocks:
             for part in _parts(block):
-                here = [np.take(scale, part.owner, axis=0) for scale in resolved]
+                here = [of_receivers(found, part.owner) for found in resolved]
                 coefficients = field.evaluate(part.seen, receivers.take(part.owner), part.casters, here, upto)
                 # Curves must not see more noise than they have to: they would turn it into bias.
                 arrives = part.brought if aggregate is None else part.emitted * part.seen
@@ -91,18 +92,22 @@ def edited_light(
             result += offset_radiance(field, offsets, receivers, albedo, resolved, upto, aggregate)
         return result
 
-    resolved: list[F32] = []
-    added = np.zeros((n, 3), np.float32)
+    def reach(aggregate: Aggregate) -> F32:
+        found = np.zeros((n, 3))
+        for block in blocks:
+            if block.through is None:
+                found += _sum_by(block.owner, block.casters.masks[aggregate.row][:, None] * block.emitted, n)
+        return found.astype(np.float32)
+
+    resolved: list[PairCoefficients] = []
     for aggregate in field.aggregates:
-        weight = field.aggregate_weight(aggregate, receivers)
-        if not weight.any():
-            resolved.append(np.ones((n, 3), np.float32))
+        if not receivers.masks[aggregate.row].any():
+            resolved.append(PairCoefficients(np.ones((n, 3), np.float32)))
             continue
         # Keys of one edit see the same weaker stack.
-        scale, rest = field.resolve(aggregate, total(resolved, aggregate.upto, aggregate))
-        resolved.append(scale)
-        added += weight * rest
-    return total(resolved) + added
+        scale, added = field.resolve(aggregate, total(resolved, aggregate.upto, aggregate))
+        resolved.append(sent_anew(scale, added, reach(aggregate)))
+    return total(resolved)
 
 
 def _parts(block: PairLight) -> Iterator[PairLight]:

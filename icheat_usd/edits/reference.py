@@ -4,7 +4,8 @@
 
 `h` is transport that the occluders of edit k hold back, and `P` how much of
 it the edit lets through. Aggregates scale S, E, O and P of a receiver's pairs
-by what they make of the sum over their casters, and views act on the result;
+by what they make of the sum over their casters, which send as E what no scale
+can reach, and views act on the result;
 `l` runs over groups of lights. This loop is the definition; every renderer is
 tested against it.
 """
@@ -34,12 +35,19 @@ class PairFunctions(NamedTuple):
     through: F64Array  #: (n_throughs, G, 3)
 
 
+class Resolved(NamedTuple):
+    """What an aggregate came to at one receiver, float64."""
+
+    scale: F64Array  #: (3,)
+    emission: F64Array  #: (3,) radiance that each of its casters sends anew
+
+
 def pair_functions(
     field: EditField,
     b: F64Array,
     receiver: Ends,
     caster: Ends,
-    resolved: Sequence[F64Array] = (),
+    resolved: Sequence[Resolved] = (),
     upto: int | None = None,
 ) -> PairFunctions:
     """S, E, O and P for one pair.
@@ -48,7 +56,7 @@ def pair_functions(
     ----------
     b : (G, 3) radiance that leaves the gather sample, by group of lights
     receiver, caster : Ends of one point each
-    resolved : scale (3,) of each aggregate at this receiver
+    resolved : what each aggregate came to at this receiver
     upto : compose only the edits before this one
     """
     n_groups = len(b)
@@ -62,9 +70,9 @@ def pair_functions(
         located += sum(rows is not None for rows in bound.rows)
         if bound.level is Level.VIEW:
             continue
-        scales: Sequence[F64Array] = ()
+        found: Sequence[Resolved] = ()
         if bound.level is Level.AGGREGATE:
-            scales = resolved[n_resolved : n_resolved + bound.n_keys]
+            found = resolved[n_resolved : n_resolved + bound.n_keys]
             n_resolved += bound.n_keys
         shares = _key_shares(bound, receiver, first_located)
         weights = [
@@ -83,7 +91,7 @@ def pair_functions(
         added: dict[Any, F64Array] = {}
         for key, weight in enumerate(weights):
             if bound.level is Level.AGGREGATE:
-                delta = delta + weight * (scales[key] - 1)
+                delta, e = delta + weight * (found[key].scale - 1), e + weight * found[key].emission
                 continue
             s_key, e_key, o_key, p_key = _coefficients(bound, key, seen, receiver, caster, first_located)
             delta, e = delta + weight * (s_key - 1), e + weight * e_key
@@ -157,7 +165,7 @@ def edited_radiance(
     for i in range(n_view):
         receiver = receivers.take(np.array([i]))
 
-        def total(resolved: Sequence[F64Array], upto: int | None, row: int | None, groups: Any, i: int = i) -> F64Array:
+        def total(resolved: Sequence[Resolved], upto: int | None, row: int | None, groups: Any, i: int = i) -> F64Array:
             """Light of receiver i; of an aggregate's casters (mask `row`) and `groups` of lights alone where asked."""
             light = np.zeros(3)
             for j in range(n_gather):
@@ -173,16 +181,16 @@ def edited_radiance(
                 light = light + pair * (1.0 if row is None else float(casters.masks[row, j]))
             return light
 
-        resolved: list[F64Array] = []
-        added = np.zeros(3)
+        resolved: list[Resolved] = []
         for aggregate in field.aggregates:
             bound = field.edits[aggregate.edit]
             # Keys of one edit see the same weaker stack.
             light = total(resolved, aggregate.upto, aggregate.row, bound.groups)
-            scale, rest = field.resolve(aggregate, light.astype(np.float32)[None, :])
-            resolved.append(scale[0].astype(np.float64))
-            added = added + field.aggregate_weight(aggregate, receiver)[0] * rest[0]
-        result[i] = _finish(field, total(resolved, None, None, None) + added, receiver)
+            scale, added = field.resolve(aggregate, light.astype(np.float32)[None, :])
+            reach = sum(transport[i, j] * float(casters.masks[aggregate.row, j]) for j in range(n_gather))
+            emission = np.divide(added[0], reach, out=np.zeros(3), where=reach > 0)
+            resolved.append(Resolved(scale[0].astype(np.float64), emission))
+        result[i] = _finish(field, total(resolved, None, None, None), receiver)
     return result
 
 

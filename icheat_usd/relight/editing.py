@@ -82,12 +82,19 @@ class _SharedReceivers:
                 seen = self.light(upto=aggregate.upto, aggregate=aggregate)
                 scale, added = self.field.resolve(aggregate, seen)
                 weight = np.float32(bound.edit.amount * bound.key_weights[key]) * mask
-                result += weight * ((scale - ONE) * seen + added)
+                result += weight * ((scale - ONE) * seen + np.where(self.reach(row) > 0, added, np.float32(0)))
             else:
                 masks = self.ends.masks.copy()
                 masks[rows] = 0
                 masks[row] = 1
                 result += mask * (self.light(self.ends._replace(masks=masks)) - below)
+        return result
+
+    def reach(self, row: int) -> F32:
+        """Transport from the casters of one row of the masks, weighted by these: (n, 3)."""
+        weight = np.repeat(self.lit.ends.masks[row][:, None], 3, axis=1)
+        result = np.zeros((len(self.samples), 3), np.float32)
+        _add_products(self.transport.lobes, self.transport.interpolation, self.samples, weight, result)
         return result
 
     def light(self, ends: Ends | None = None, upto: int | None = None, aggregate: Aggregate | None = None) -> F32:

@@ -168,6 +168,7 @@ def test_operations_on_interpolated_rows_equal_the_slow_evaluator(operation, mon
 
 MIXED = {
     "two curves": ("gamma", "scale", "curve"),
+    "a curve below": ("curve", "scale", "hsv"),
     "curve of what passes": ("unshadow", "gamma"),
     "curve of paint": ("paint", "gamma", "falloff"),
     "passing a curve": ("gamma", "unshadow", "receive"),
@@ -212,6 +213,17 @@ def test_full_over_shows_the_edit_alone(operation):
     alone, both = (of.relighter.relight(of.field(*edits)).indirect_edited for edits in ((strong,), (*weaker, strong)))
     assert np.abs(alone - of.relight().indirect).max() > 0.003
     np.testing.assert_allclose(both, alone, atol=1e-5 * np.abs(alone).max())
+
+
+def test_what_a_curve_lifts_out_of_the_dark_is_dimmed_by_stronger_edits():
+    of = pipeline("full")
+    lift = Edit("/lift", "curve", {"inputs": (0.0, 1.0), "outputs": (0.2, 1.0)}, SOME, EVERYTHING)
+    out = Edit("/out", "scale", {"gain": 0.0}, SOME, EVERYTHING)
+    lifted, dimmed, alone = (
+        of.relighter.relight(of.field(*edits)).indirect_edited for edits in ((lift,), (lift, out), (out,))
+    )
+    assert np.abs(lifted - of.relight().indirect).max() > 0.1
+    np.testing.assert_allclose(dimmed, alone, atol=1e-5)
 
 
 def test_patches_of_casters_stand_for_all_of_them(monkeypatch):

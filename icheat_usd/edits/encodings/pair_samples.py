@@ -7,6 +7,7 @@ import numpy as np
 from icheat_usd.edits.encodings.coding import RowCoder
 from icheat_usd.edits.encodings.sampled import KINDS
 from icheat_usd.edits.field import EditField, Ends
+from icheat_usd.edits.operations import PairCoefficients
 from icheat_usd.progress import Progress
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, F64, I64, Bool
@@ -67,7 +68,7 @@ class PairSamples:
         receivers = self.receivers.take(np.repeat(samples, m))
         casters = self._casters.take(np.tile(gather, n))
         b = np.tile(self._radiance[gather], (n, 1))[None]
-        resolved = [np.repeat(scale[samples], m, axis=0) for scale in self.resolved]
+        resolved = [PairCoefficients(np.repeat(scale[samples], m, axis=0)) for scale in self.resolved]
         found = self.field.evaluate(b, receivers, casters, resolved)
         parts = [found.scale[0] - np.float32(1), found.emission]
         if len(self.kinds) == 3:

@@ -22,7 +22,8 @@ class Curve(Operation):
     The curve goes through its knots without overshoot, holds the first output
     before them, goes on straight after them, and never goes below 0. It acts
     on the sum over the casters, as 'gamma' does. Where there is no light, what
-    the curve makes of it is grey.
+    the curve makes of it is grey; the casters send it, all alike, so that it
+    comes only where they reach and are reflected, and stronger edits dim it.
     """
 
     name = "curve"
