@@ -170,7 +170,26 @@ def add_command(options: argparse.Namespace) -> int:
     return _report(options, path, layer, inspection.idle_edit(stage, path, options.variant))
 
 
-def _members(options: argparse.Namespace, side: str) -> Any:
+def _included(stage: Any, edit: str, options: argparse.Namespace, side: str) -> tuple[str, ...]:
+    """What an edit includes already, where the options only exclude: an exclusion alone takes nothing else away.
+
+    Raises
+    ------
+    EditError
+        It selects by an expression, which knows no exclusions.
+    """
+    from icheat_usd.errors import EditError
+    from icheat_usd.session import inspection
+
+    if not getattr(options, f"exclude_{side}") or getattr(options, side):
+        return ()
+    included, expression = inspection.included(stage, edit, side, options.variant)
+    if expression and not getattr(options, f"{side}_expression"):
+        raise EditError(f"{edit}: its {side} are '{expression}'; exclude with --{side}-expression '… - //NAME//'")
+    return included
+
+
+def _members(options: argparse.Namespace, side: str, already: tuple[str, ...] = ()) -> Any:
     """What the options select on one side, None where they say nothing."""
     from icheat_usd.stage.authoring import Members
 
@@ -178,7 +197,7 @@ def _members(options: argparse.Namespace, side: str) -> Any:
     expression = getattr(options, f"{side}_expression")
     if not (included or excluded or expression):
         return None
-    return Members(tuple(included or ()), tuple(excluded), expression or "")
+    return Members(tuple(included or already), tuple(excluded), expression or "")
 
 
 def _related(options: argparse.Namespace) -> dict[str, Any]:
@@ -202,7 +221,7 @@ def brush(session: Any, numbers: tuple[float, ...]) -> Any:
 def set_command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.authoring import named_edit, open_for_writing
     from icheat_usd.errors import EditError
-    from icheat_usd.session import authoring
+    from icheat_usd.session import authoring, inspection
 
     stage, layer = open_for_writing(options)
     _, edit = named_edit(stage, options)
@@ -211,10 +230,13 @@ def set_command(options: argparse.Namespace) -> int:
     values["variant"] = options.variant
     values |= _related(options)
     for side in ("receivers", "casters"):
-        values[side] = _members(options, side)
+        values[side] = _members(options, side, _included(stage, edit, options, side))
     if all(value is None for name, value in values.items() if name not in ("time", "variant")):
         raise EditError(f"there is nothing to set on {edit}; give --set, --amount or another value")
-    return _report(options, edit, layer, authoring.set_edit(stage, edit, layer=layer, **values))
+    findings = authoring.set_edit(stage, edit, layer=layer, **values)
+    if any(values[name] is not None for name in ("operation", "receivers", "casters", "occluders")):
+        findings += inspection.idle_edit(stage, edit, options.variant)
+    return _report(options, edit, layer, findings)
 
 
 def mute_command(options: argparse.Namespace) -> int:

@@ -27,13 +27,19 @@ def make_images(options: argparse.Namespace, quality: Quality, make: Callable[[S
     Raises
     ------
     ImageError
-        An output cannot be named or its folder does not exist; found before anything is computed.
+        An output cannot be named, its folder does not exist, or there is no such view; found before anything is
+        computed.
     """
     frames: tuple[float | None, ...] = options.frames or (options.frame,)
     files = {frame: _outputs(options.out, frame, len(frames)) for frame in frames}
 
     from icheat_usd.session import Session
     from icheat_usd.stage import open_stage
+
+    if any(path.suffix.lower() == ".png" for paths in files.values() for path in paths):
+        from icheat_usd.image.colour import check_view
+
+        check_view(options.view)
 
     images: list[dict[str, Any]] = []
     found: dict[Any, None] = {}

@@ -148,6 +148,11 @@ def _working_space(config: Any) -> str:
         ) from problem
 
 
+def check_view(view: str | None) -> None:
+    """Find out before anything is rendered. Raises `ImageError` if the default display has no such view."""
+    _processor(os.environ.get("OCIO", ""), "", view or "")
+
+
 @lru_cache(maxsize=32)
 def _processor(variable: str, display: str, view: str) -> Any:
     config = _config(variable)

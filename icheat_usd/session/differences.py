@@ -212,7 +212,7 @@ def _in(layer: str) -> str:
 
 
 def _when(key: Key) -> str:
-    return "" if key.time is None else f" at {key.time:g}"
+    return " for all times" if key.time is None else f" at {key.time:g}"
 
 
 def _same_time(key: Key, keys: Sequence[Key]) -> Key | None:

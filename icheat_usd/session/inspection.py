@@ -70,6 +70,13 @@ def check(stage: Any, frame: float | None = None) -> tuple[Finding, ...]:
     return (*composition_findings(stage), *check_stage(stage, frame, read_payload))
 
 
+def included(stage: Any, edit: str, side: str, variant: tuple[str, str] | None = None) -> tuple[tuple[str, ...], str]:
+    """Paths that the "receivers" or "casters" of an edit, maybe one of a variant, include, and their expression."""
+    with selected_variant(stage, edit, variant):
+        described = describe_edit(stage, edit)
+        return tuple(getattr(described, side)), str(getattr(described, f"{side}_expression"))
+
+
 def idle_edit(stage: Any, edit: str, variant: tuple[str, str] | None = None) -> tuple[Finding, ...]:
     """What an edit, maybe one of a variant, still lacks before it can do anything; no payload is read."""
     rules = [rule for rule in RULES if isinstance(rule, (EmptySelection, UnshadowWithoutOccluders))]

@@ -11,8 +11,11 @@ from typing import Any
 from icheat_usd import sidecar
 from icheat_usd.errors import SidecarError
 from icheat_usd.sidecar import SUFFIX
+from icheat_usd.stage.edit_stack import open_asset
+from icheat_usd.stage.keys import read_keys
 from icheat_usd.stage.pinned import keys_and_layers
 from icheat_usd.stage.sidecar_uses import TRASH
+from icheat_usd.stage.stacks import edit_prim
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,9 @@ def edit_history(stage: Any, edit: str) -> tuple[list[Event], list[str]]:
         There is no such edit, or its keys cannot be read.
     """
     keys, layers = keys_and_layers(stage, edit)
+    prim = edit_prim(stage, edit)
+    track = read_keys(prim)
+    named_in = {key.anchored: key for key in (track.keys if track else ()) if key.digest}
     now: dict[str, list[str]] = {}
     problems: list[str] = []
     events: dict[tuple[str, str, str], Event] = {}
@@ -64,8 +70,9 @@ def edit_history(stage: Any, edit: str) -> tuple[list[Event], list[str]]:
         now.setdefault(key.digest, []).append("always" if key.time is None else f"{key.time:g}")
     for file in files:
         try:
-            entries += [(file, entry) for entry in sidecar.read_history(file)]
-            for old, new in sidecar.list_aliases(file).items():
+            source = open_asset(prim, named_in[file]) if file in named_in else file
+            entries += [(file, entry) for entry in sidecar.read_history(source, name=file)]
+            for old, new in sidecar.list_aliases(source, name=file).items():
                 current.setdefault(old, set()).add(new)
         except SidecarError as problem:
             problems.append(str(problem))

@@ -55,6 +55,8 @@ def files(folder: Path) -> Mapping[str, bytes]:
         ("key copy SHOT warm --from nan --frame 3", "'nan' is no time code"),
         ("key remove SHOT warm --frame 3", "no key at 3; it has one payload for all times"),
         ("edit add SHOT new --set gian=2", "has no parameter 'gian'; it has color, gain"),
+        ("edit add SHOT new --set gain=1e39", "new: parameter 'gain' is 1e+39, expected something like 1.0"),
+        ("relight SHOT -o DIR/a.png --view nope", "has no view 'nope'"),
         ("edit add SHOT new --before new", "new cannot lie before or after itself"),
         ("edit add SHOT new --receivers Bal", "no prim /World/Bal; did you mean /World/Ball?"),
         ("edit add SHOT new --receivers Xyz/Deep", "no prim /World/Xyz/Deep; /World has Ball, Wall, Camera, Edits"),
@@ -68,7 +70,8 @@ def test_a_mistake_is_one_line_and_changes_nothing(
 ) -> None:
     before = files(shot.parent)
     capsys.readouterr()
-    assert main([*words.replace("SHOT", str(shot)).split(), "--json"]) == 2
+    words = words.replace("SHOT", str(shot)).replace("DIR", str(shot.parent))
+    assert main([*words.split(), "--json"]) == 2
     output = capsys.readouterr()
     assert message in output.err and output.err.count("\n") == 1
     assert json.loads(output.out) == {"version": 1, "error": output.err.strip().removeprefix("icheat: error: ")}
@@ -90,6 +93,41 @@ def test_what_a_new_edit_lacks_is_said_at_once(
     assert message in capsys.readouterr().err
     assert main(["edit", "remove", str(shot), "new"]) == 0
     assert main(["check", str(shot)]) == 0
+
+
+def test_an_exclusion_alone_keeps_what_is_included(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["edit", "set", str(shot), "warm", "--receivers", "Ball", "Wall"]) == 0
+    assert main(["edit", "set", str(shot), "warm", "--exclude-receivers", "Wall"]) == 0
+    capsys.readouterr()
+    assert main(["edit", "list", str(shot), "--json"]) == 0
+    (edit,) = json.loads(capsys.readouterr().out)["edits"]
+    assert set(edit["receivers"]["includes"]) == {"/World/Ball", "/World/Wall"}
+    assert edit["receivers"]["excludes"] == ["/World/Wall"]
+    assert main(["edit", "set", str(shot), "warm", "--casters-expression", "//{isa:Sphere}"]) == 0
+    assert main(["edit", "set", str(shot), "warm", "--exclude-casters", "Ball"]) == 2
+    assert "exclude with --casters-expression" in capsys.readouterr().err
+
+
+def test_an_expression_that_matches_nothing_is_said_when_it_is_set(
+    shot: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["edit", "set", str(shot), "warm", "--receivers-expression", "//Props//*"]) == 1
+    assert "no prim matches '//Props//*'" in capsys.readouterr().err
+    assert main(["check", str(shot)]) == 1
+    assert "no prim matches '//Props//*'" in capsys.readouterr().out
+
+
+def test_the_history_of_a_packaged_edit_is_read_from_the_package(
+    shot: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pxr import UsdUtils
+
+    monkeypatch.chdir(shot.parent)
+    assert UsdUtils.CreateNewUsdzPackage("shot.usda", "shot.usdz")
+    capsys.readouterr()
+    assert main(["history", "shot.usdz", "warm", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert len(content["events"]) == 1 and content["problems"] == []
 
 
 def test_an_edit_that_a_layer_took_out_is_named_as_such(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,9 @@ from icheat_usd.edits.model import Value
 from icheat_usd.errors import EditError
 from icheat_usd.scene import F32
 
+#: No parameter exceeds what 32-bit floats hold, in which USD keeps it and light is computed.
+_LARGEST = 3.4e38
+
 
 class Level(StrEnum):
     """What an operation acts on."""
@@ -191,7 +194,7 @@ def _checked(value: Value, parameter: Parameter, where: str) -> Value:
         fits = isinstance(value, type(expected))
     else:
         fits = isinstance(value, tuple) == isinstance(expected, tuple) and all(
-            isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) < float("inf") for x in components
+            isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= _LARGEST for x in components
         )
         fits = fits and (not isinstance(expected, tuple) or parameter.is_array or len(components) == len(expected))
     if not fits:
