@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from icheat_usd.edits import operations
 from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask, Value
+from icheat_usd.edits.operations.base import plain_values
 from icheat_usd.edits.operations.constants import baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.scene import F32, F64, Finding
@@ -117,14 +119,13 @@ def set_key(
     if identity:
         if parameters or receiver_mask is not None or caster_mask is not None:
             raise EditError(f"{edit}: an identity key has no parameters and no masks; leave them out")
-        findings = key_authoring.set_payload_key(
-            stage, edit, layer=target, time=frame, payload=None, interpolation=interpolation, variant=variant
-        )
-        _save(target)
-        return findings
+        with _saved(stage, edit, target, variant):
+            return key_authoring.set_payload_key(
+                stage, edit, layer=target, time=frame, payload=None, interpolation=interpolation, variant=variant
+            )
     with selected_variant(stage, edit, variant):
         return _set_payloads(
-            _Made(stage, edit, frame, dict(parameters or {})),
+            _Made(stage, edit, frame, plain_values(parameters)),
             frame,
             (receiver_mask, caster_mask),
             target,
@@ -164,7 +165,7 @@ def _set_payloads(
             history = history_entry(why, edit)
             file, digests = write_payloads(beside, payloads.values(), anchor=anchor_path(made.prim), history=history)
             named = {time: (file, digest) for time, digest in zip(payloads, digests, strict=True)}
-        with layers.writing(stage, target, edit, variant):
+        with _saved(stage, edit, target, variant):
             findings: tuple[Finding, ...] = ()
             for time, payload in named.items():
                 findings = key_authoring.set_payload_key(
@@ -177,7 +178,6 @@ def _set_payloads(
                     variant=variant,
                 )
             released = key_authoring.release_parameters(stage, edit, made.released(), layer=target, variant=variant)
-            _save(target)
     except Exception:
         # Not after an interruption: the layer may have been saved already, and then names this file.
         if file is not None:
@@ -191,9 +191,8 @@ def copy_key(
 ) -> tuple[Finding, ...]:
     """Let the payload of the key at `frame` hold at `to` too, and save the layer."""
     target = layers.find_layer(stage, layer)
-    findings = key_authoring.copy_payload_key(stage, edit, layer=target, time=frame, to=to, variant=variant)
-    _save(target)
-    return findings
+    with _saved(stage, edit, target, variant):
+        return key_authoring.copy_payload_key(stage, edit, layer=target, time=frame, to=to, variant=variant)
 
 
 def remove_key(
@@ -201,9 +200,8 @@ def remove_key(
 ) -> tuple[Finding, ...]:
     """Take the key at `frame` out and save the layer; the only key stays, see `stage.key_authoring`."""
     target = layers.find_layer(stage, layer)
-    findings = key_authoring.remove_payload_key(stage, edit, layer=target, time=frame, variant=variant)
-    _save(target)
-    return findings
+    with _saved(stage, edit, target, variant):
+        return key_authoring.remove_payload_key(stage, edit, layer=target, time=frame, variant=variant)
 
 
 def set_interpolation(
@@ -211,11 +209,10 @@ def set_interpolation(
 ) -> tuple[Finding, ...]:
     """Set what happens between the keys and save the layer."""
     target = layers.find_layer(stage, layer)
-    findings = key_authoring.set_key_interpolation(
-        stage, edit, layer=target, interpolation=interpolation, variant=variant
-    )
-    _save(target)
-    return findings
+    with _saved(stage, edit, target, variant):
+        return key_authoring.set_key_interpolation(
+            stage, edit, layer=target, interpolation=interpolation, variant=variant
+        )
 
 
 def payload_at(stage: Any, edit: str, frame: float | None, made_against: Mapping[str, str | float | int]) -> Payload:
@@ -356,6 +353,10 @@ def _equal(a: SurfaceMask | None, b: SurfaceMask | None) -> bool:
     return a.surfaces == b.surfaces and np.array_equal(a.texels, b.texels)
 
 
-def _save(target: Any) -> None:
-    if not target.anonymous:
-        layers.save_layer(target)
+@contextmanager
+def _saved(stage: Any, edit: str, target: Any, variant: tuple[str, str] | None) -> Iterator[None]:
+    """Write to an edit, then save the layer; after any error the layer says what it said before."""
+    with layers.writing(stage, target, edit, variant):
+        yield
+        if not target.anonymous:
+            layers.save_layer(target)

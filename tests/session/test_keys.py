@@ -170,6 +170,27 @@ def test_a_refused_key_leaves_layers_and_folder_as_they_were(
     assert not find_layer(stage, "seq.usda").dirty
 
 
+def test_a_layer_that_cannot_be_saved_says_what_it_said(stage: Usd.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    for frame in (1, 11):
+        keys.set_key(stage, WARM, layer="seq.usda", frame=frame)
+    before = layer(stage, "seq.usda").ExportToString()
+
+    def refuse(target: object) -> None:
+        raise EditError("no space")
+
+    monkeypatch.setattr("icheat_usd.stage.layers.save_layer", refuse)
+    for change in (
+        lambda: keys.set_key(stage, WARM, layer="seq.usda", frame=5, parameters={"gain": 4.0}),
+        lambda: keys.set_key(stage, WARM, layer="seq.usda", frame=5, identity=True),
+        lambda: keys.copy_key(stage, WARM, layer="seq.usda", frame=1, to=5),
+        lambda: keys.remove_key(stage, WARM, layer="seq.usda", frame=1),
+        lambda: keys.set_interpolation(stage, WARM, layer="seq.usda", interpolation="held"),
+    ):
+        with pytest.raises(EditError, match="no space"):
+            change()
+        assert layer(stage, "seq.usda").ExportToString() == before
+
+
 def test_an_unchanged_payload_is_named_again_and_not_written_again(stage: Usd.Stage, tmp_path: Path) -> None:
     digest = edit_at(stage, 1).keys[0].digest
     files = sorted(tmp_path.glob("*.h5"))
