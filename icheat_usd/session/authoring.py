@@ -12,6 +12,7 @@ from typing import Any
 
 from icheat_usd.edits import operations
 from icheat_usd.edits.model import Blend, Payload, Rule, SurfaceMask, Value
+from icheat_usd.edits.operations.base import plain_values
 from icheat_usd.edits.operations.constants import BakedConstants, baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.scene import Finding
@@ -96,7 +97,7 @@ def add_edit(
         Something named does not exist or cannot be written. The layer is then
         as before, and no sidecar is left behind.
     """
-    parameters = parameters or {}
+    parameters = plain_values(parameters)
     written_to = authoring.find_layer(stage, layer)
     stack_path = stack or _default_stack(stage)
     if not _is_known(operation):
@@ -155,6 +156,8 @@ def add_edit(
 
 def set_edit(stage: Any, edit: str, *, layer: str, **values: Any) -> tuple[Finding, ...]:
     """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`."""
+    if values.get("parameters"):
+        values["parameters"] = plain_values(values["parameters"])
     operation = values.get("operation")
     if operation is not None and operation != operations.BAKED and not _is_known(operation):
         # A baked payload would go on acting as before, under a name that somebody misspelt.

@@ -6,7 +6,7 @@ from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from icheat_usd.edits.model import Value
 from icheat_usd.errors import EditError
@@ -171,6 +171,17 @@ class Operation(ABC):
                 listed = ", ".join(sorted(known))
                 raise EditError(f"{where}: operation '{self.name}' has no parameter '{name}'; it has {listed}")
         return {name: _checked(given.get(name, p.default), p, where) for name, p in known.items()}
+
+
+def plain_values(parameters: Mapping[str, Any] | None) -> dict[str, Value]:
+    """Parameters as scripts give them, lists and NumPy's numbers and vectors too, in the types of `Value`."""
+
+    def plain(value: Any) -> Value:
+        if hasattr(value, "tolist"):  # NumPy's, and of the same kind in other libraries
+            value = value.tolist()
+        return tuple(value) if isinstance(value, list) else value
+
+    return {name: plain(value) for name, value in (parameters or {}).items()}
 
 
 def number(parameters: Mapping[str, Value], name: str) -> float:
