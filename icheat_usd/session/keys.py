@@ -238,6 +238,12 @@ class _Made:
         self._keys = track.keys if track else ()
         self._share = track.at(frame) if track else ()
         self._payloads = [(self._read(key), weight) for key, weight in self._share if key.digest]
+        if 0 < len(self._payloads) < len(self._share):
+            message = (
+                f"one of the keys around frame {frame or 0.0:g} is the identity, which no payload can be part of;"
+                " the new key has the other at full strength, so lower its parameters to fade it"
+            )
+            self.findings.append(EditFinding(edit, schema.PAYLOAD, message))
         self.operation = self._operation()
         known = schema.operations().get(self.operation)
         self._names = {name: p.name for name, p in known.parameters.items()} if known else {}

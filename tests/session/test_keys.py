@@ -136,6 +136,13 @@ def test_a_key_between_two_others_is_as_the_edit_was_there(stage: Usd.Stage) -> 
     np.testing.assert_allclose(middle.receiver_mask.texels, mean, atol=0.51 / 255)
 
 
+def test_a_key_beside_the_identity_is_at_full_strength_and_a_finding(stage: Usd.Stage) -> None:
+    keys.set_key(stage, WARM, layer="seq.usda", frame=1)
+    keys.set_key(stage, WARM, layer="seq.usda", frame=11, identity=True)
+    (finding,) = keys.set_key(stage, WARM, layer="seq.usda", frame=6)
+    assert "identity" in finding.message and gains(stage, 6) == gains(stage, 1)
+
+
 def test_identity_keys_and_interpolations(stage: Usd.Stage) -> None:
     keys.set_key(stage, WARM, layer="seq.usda", frame=1)
     keys.set_key(stage, WARM, layer="seq.usda", frame=11, identity=True, interpolation="smooth")
