@@ -80,7 +80,7 @@ def _verb(
     parser.add_argument("--camera", metavar="PRIM", help="camera whose stack is meant")
     if writes:
         add_layer(parser)
-        add_variant(parser)
+    add_variant(parser, "write into" if writes else "look at")
     if name == "list":
         add_frame(parser)
     elif name in ("add", "set"):
@@ -273,10 +273,14 @@ def remove_command(options: argparse.Namespace) -> int:
 def list_command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.tree import edit_as_json, edit_summary
     from icheat_usd.session import inspection
+    from icheat_usd.stage.variants import selected_variant
 
     stage = inspection.open_stage(options.stage)
     path = inspection.find_stack(stage, options.stack, options.camera)
-    edits = inspection.describe_stack(stage, path, options.frame).edits if path is not None else ()
+    edits: tuple[Any, ...] = ()
+    if path is not None:
+        with selected_variant(stage, path, options.variant):
+            edits = inspection.describe_stack(stage, path, options.frame).edits
     if options.json:
         print_json({"stage": options.stage, "stack": path, "edits": [edit_as_json(edit) for edit in edits]})
         return 0

@@ -79,7 +79,8 @@ def _verb(
     parser.add_argument("--camera", metavar="PRIM", help="camera whose stack is meant")
     if frame:
         add_layer(parser)
-        add_variant(parser)
+    add_variant(parser, "write into" if frame else "look at")
+    if frame:
         parser.add_argument("--frame", type=time_code, required=name != "set", metavar="T", help=frame)
     add_json(parser)
     parser.set_defaults(command=command)
@@ -142,10 +143,12 @@ def list_command(options: argparse.Namespace) -> int:
     """Exit with 1 where a file is missing or the layer that keys were copied from has moved on."""
     from icheat_usd.cli.authoring import named_edit
     from icheat_usd.session import inspection, keys
+    from icheat_usd.stage.variants import selected_variant
 
     stage = inspection.open_stage(options.stage)
     _, edit = named_edit(stage, options)
-    listed = keys.list_keys(stage, edit)
+    with selected_variant(stage, edit, options.variant):
+        listed = keys.list_keys(stage, edit)
     if options.json:
         print_json(asdict(listed))
     else:

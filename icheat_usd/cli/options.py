@@ -33,12 +33,13 @@ def add_layer(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_variant(parser: argparse.ArgumentParser) -> None:
+def add_variant(parser: argparse.ArgumentParser, what: str = "write into") -> None:
+    """For verbs that write, and for those that look at a variant as if it were selected."""
     parser.add_argument(
         "--variant",
         type=variant,
         metavar="SET=VARIANT",
-        help="write into this variant of the stack's prim, or of the edit's own, such as grade=dusk",
+        help=f"{what} this variant of the stack's prim, or of the edit's own, such as grade=dusk",
     )
 
 

@@ -11,7 +11,16 @@ import argparse
 import os
 from typing import Any
 
-from icheat_usd.cli.options import add_frame, add_json, add_stack, add_stage, aligned, file_size, print_json
+from icheat_usd.cli.options import (
+    add_frame,
+    add_json,
+    add_stack,
+    add_stage,
+    add_variant,
+    aligned,
+    file_size,
+    print_json,
+)
 from icheat_usd.errors import EditError
 
 
@@ -19,6 +28,7 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     add_stage(parser)
     add_stack(parser)
     parser.add_argument("--camera", metavar="PRIM", help="camera whose stack is meant")
+    add_variant(parser, "look at")
     add_frame(parser)
     parser.add_argument("--quick", action="store_true", help="do not compare baked payloads with the scene")
     add_json(parser)
@@ -27,13 +37,15 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
 def command(options: argparse.Namespace) -> int:
     from icheat_usd.session import inspection
     from icheat_usd.session.payload_states import encoding, payload_states
+    from icheat_usd.stage.variants import selected_variant
 
     stage = inspection.open_stage(options.stage)
     path = inspection.find_stack(stage, options.stack, options.camera)
     if path is None:
         raise EditError(f"{options.stage} has no edit stack; make one with `icheat stack create`")
-    stack = inspection.describe_stack(stage, path, options.frame)
-    states = payload_states(stage, list(stack.edits), options.frame, scene=not options.quick)
+    with selected_variant(stage, path, options.variant):
+        stack = inspection.describe_stack(stage, path, options.frame)
+        states = payload_states(stage, list(stack.edits), options.frame, scene=not options.quick)
     encodings = {edit.path: encoding(edit, states[edit.path]) for edit in stack.edits}
     if options.json:
         edits = [

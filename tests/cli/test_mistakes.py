@@ -138,6 +138,29 @@ def test_an_edit_that_a_layer_took_out_is_named_as_such(shot: Path, capsys: pyte
     assert "exists already; choose another name as the stack does not list it" in capsys.readouterr().err
 
 
+def test_a_grade_can_be_looked_at_without_selecting_it(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(shot))
+    grades = stage.GetPrimAtPath("/World/Edits").GetVariantSets().AddVariantSet("grade")
+    for name in ("day", "dusk"):
+        grades.AddVariant(name)
+    grades.SetVariantSelection("day")
+    stage.Save()
+    dusk = ("--variant", "grade=dusk")
+    assert main(["edit", "add", str(shot), "glow", *SELECTED, "--set", "gain=3", *dusk]) == 0
+    before = files(shot.parent)
+    capsys.readouterr()
+    for verb, arguments in (("edit list", ()), ("tree", ()), ("key list", ("glow",))):
+        assert main([*verb.split(), str(shot), *arguments, *dusk]) == 0
+        assert "glow" in capsys.readouterr().out
+    assert main(["tree", str(shot)]) == 0
+    assert "glow" not in capsys.readouterr().out
+    assert main(["tree", str(shot), "--variant", "grade=noon"]) == 2
+    assert "no variant 'noon'; it has day, dusk" in capsys.readouterr().err
+    assert files(shot.parent) == before
+
+
 def test_edits_are_listed_in_columns(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["edit", "add", str(shot), "muchLonger", "--operation", "hsv", *SELECTED, "--set", "hue=20"]) == 0
     capsys.readouterr()
