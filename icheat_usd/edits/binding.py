@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from icheat_usd.edits import operations
+from icheat_usd.edits.bound import BoundEdit
 from icheat_usd.edits.encodings.rows import bind_rows
-from icheat_usd.edits.field import BoundEdit, EditField
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.measures import Measures
 from icheat_usd.edits.model import Edit, EditStack, Payload, Selection, Value
 from icheat_usd.edits.operations import Measure, Operation, PairCoefficients

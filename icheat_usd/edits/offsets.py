@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.edits.field import Aggregate, EditField, Ends, of_receivers
+from icheat_usd.edits.bound import Aggregate, Ends, of_receivers
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.operations import Level, Operation, PairCoefficients
 from icheat_usd.scene import F32, F64, I64, Bool
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.edits.field import Aggregate, EditField, Ends, StackCoefficients, of_receivers, sent_anew, weighted
+from icheat_usd.edits.bound import Aggregate, Ends, StackCoefficients, of_receivers, sent_anew, weighted
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import PAIRS_AT_ONCE, OffsetCasters, offset_radiance
 from icheat_usd.edits.operations import PairCoefficients
 from icheat_usd.scene import F32, I64

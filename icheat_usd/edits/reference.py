@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icheat_usd.edits.field import BoundEdit, EditField, Ends
+from icheat_usd.edits.bound import BoundEdit, Ends
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.operations import Level, PairEnd, Pairs
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.edits.field import Aggregate, EditField, Ends
+from icheat_usd.edits.bound import Aggregate, Ends
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.offsets import OffsetCasters, offset_casters, offset_sums
 from icheat_usd.edits.operations import Level

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icheat_usd.edits.field import BoundEdit, EditField, Ends
+from icheat_usd.edits.bound import BoundEdit, Ends
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.operations import Level
 from icheat_usd.samples import ViewSamples

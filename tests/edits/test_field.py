@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from icheat_usd.edits.field import BoundEdit, EditField, Ends
+from icheat_usd.edits.bound import BoundEdit, Ends
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend, Edit, Selection, Value
 from icheat_usd.edits.operations import Operation, PairCoefficients, PairEnd, Pairs, Parameter, find
 from icheat_usd.edits.reference import pair_functions

@@ -9,7 +9,7 @@ import pytest
 
 from icheat_usd.edits import operations
 from icheat_usd.edits.binding import bind
-from icheat_usd.edits.field import Ends
+from icheat_usd.edits.bound import Ends
 from icheat_usd.edits.model import Value
 from icheat_usd.session import Session
 

@@ -62,8 +62,8 @@ def check_bakeable(field: EditField, where: str) -> None:
     if field.aggregates and len(field.edits) > 1:
         names = ", ".join(bound.edit.path for bound in field.edits if bound.level is Level.AGGREGATE)
         raise EditError(
-            f"{where}: {names} looks at all light of its casters as the weaker edits leave it; bake it with"
-            " --as baked first, then flatten the stack"
+            f"{where}: {names} looks at all light of its casters as the weaker edits leave it, which rows of a whole"
+            " stack cannot hold; mute it to flatten the others, and keep it as its recipe"
         )
     for bound in field.edits:
         operation = bound.operation

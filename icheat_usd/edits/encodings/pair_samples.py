@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from icheat_usd.edits.bound import Ends
 from icheat_usd.edits.encodings.coding import RowCoder
 from icheat_usd.edits.encodings.sampled import KINDS
-from icheat_usd.edits.field import EditField, Ends
+from icheat_usd.edits.field import EditField
 from icheat_usd.edits.operations import PairCoefficients
 from icheat_usd.progress import Progress
 from icheat_usd.samples import GatherSamples, ViewSamples
