@@ -21,6 +21,7 @@ from icheat_usd.sidecar import read_payload as read_sidecar
 from icheat_usd.sidecar import write_payloads
 from icheat_usd.stage import authoring, collections, schema
 from icheat_usd.stage.authoring import Members
+from icheat_usd.stage.layers import saving
 
 
 def read_payload(file: str, source: str | bytes, digest: str, anchor: str) -> Payload:
@@ -36,9 +37,8 @@ def create_stack(stage: Any, path: str | None, *, layer: str, camera: str | None
     EditError
         The stage has no default prim to put it under, or the layer refuses.
     """
-    stack = authoring.create_stack(stage, path or _default_stack(stage), layer=layer, camera=camera)
-    _save(stage, layer)
-    return stack
+    with saving(stage, layer):
+        return authoring.create_stack(stage, path or _default_stack(stage), layer=layer, camera=camera)
 
 
 def _default_stack(stage: Any) -> str:
@@ -120,7 +120,7 @@ def add_edit(
     elif receiver_mask is not None or caster_mask is not None:
         raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
     try:
-        with authoring.writing(stage, written_to, stack_path):
+        with saving(stage, written_to):
             if stack is None:
                 authoring.create_stack(stage, stack_path, layer=written_to)
             path = authoring.add_edit(
@@ -145,7 +145,6 @@ def add_edit(
                 after=after,
                 variant=variant,
             )
-            _save(stage, layer)
     except Exception:
         # Not after an interruption: the layer may have been saved already, and then names this file.
         if written is not None:
@@ -162,9 +161,8 @@ def set_edit(stage: Any, edit: str, *, layer: str, **values: Any) -> tuple[Findi
     if operation is not None and operation != operations.BAKED and not _is_known(operation):
         # A baked payload would go on acting as before, under a name that somebody misspelt.
         raise authoring.unknown_operation(edit, operation)
-    findings = authoring.set_edit(stage, edit, layer=layer, **values)
-    _save(stage, layer)
-    return findings
+    with saving(stage, layer):
+        return authoring.set_edit(stage, edit, layer=layer, **values)
 
 
 def mute_edit(
@@ -176,28 +174,26 @@ def mute_edit(
 
 def move_edit(stage: Any, stack: str, edit: str, *, layer: str, **place: Any) -> None:
     """Move an edit within its stack and save the layer; see `stage.authoring.move_edit`."""
-    authoring.move_edit(stage, stack, edit, layer=layer, **place)
-    _save(stage, layer)
+    with saving(stage, layer):
+        authoring.move_edit(stage, stack, edit, layer=layer, **place)
 
 
 def remove_edit(stage: Any, stack: str, edit: str, *, layer: str, variant: tuple[str, str] | None = None) -> None:
     """Take an edit out of a stack and save the layer; see `stage.authoring.remove_edit`."""
-    authoring.remove_edit(stage, stack, edit, layer=layer, variant=variant)
-    _save(stage, layer)
+    with saving(stage, layer):
+        authoring.remove_edit(stage, stack, edit, layer=layer, variant=variant)
 
 
 def add_region(stage: Any, path: str, *, layer: str, **values: Any) -> str:
     """Make a region that limits can name and save the layer; see `stage.authoring.add_region`."""
-    region = authoring.add_region(stage, path, layer=layer, **values)
-    _save(stage, layer)
-    return region
+    with saving(stage, layer):
+        return authoring.add_region(stage, path, layer=layer, **values)
 
 
 def add_selection(stage: Any, path: str, parts: Sequence[str], *, layer: str, rule: Rule | str) -> str:
     """Make a selection of others that limits can name and save the layer; see `stage.authoring.add_selection`."""
-    selection = authoring.add_selection(stage, path, parts, layer=layer, rule=rule)
-    _save(stage, layer)
-    return selection
+    with saving(stage, layer):
+        return authoring.add_selection(stage, path, parts, layer=layer, rule=rule)
 
 
 def surfaces_below(stage: Any, members: Members, paths: Iterable[str]) -> list[str]:
@@ -226,9 +222,3 @@ def anchor_of(stage: Any) -> str:
     """Scene path that surface paths in new payloads are relative to: the default prim's."""
     default = stage.GetDefaultPrim()
     return str(default.GetPath()) if default else "/"
-
-
-def _save(stage: Any, layer: str) -> None:
-    target = authoring.find_layer(stage, layer)
-    if not target.anonymous:
-        authoring.save_layer(target)

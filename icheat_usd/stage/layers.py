@@ -178,6 +178,21 @@ def writing(
             raise
 
 
+@contextmanager
+def saving(stage: Usd.Stage, layer: str | Sdf.Layer) -> Iterator[None]:
+    """Write to a layer and save it if it has a file; after any error the layer says what it said before."""
+    target = find_layer(stage, layer)
+    before = Sdf.Layer.CreateAnonymous()
+    before.TransferContent(target)
+    try:
+        yield
+        if not target.anonymous:
+            save_layer(target)
+    except Exception:
+        target.TransferContent(before)
+        raise
+
+
 def spec_path(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
     """Where opinions on a stage's path lie in the layer that is written to: in a variant, if that is written to."""
     return stage.GetEditTarget().MapToSpecPath(path)
