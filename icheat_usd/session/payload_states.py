@@ -92,7 +92,7 @@ def _states(context: Context, edit: EditDescription, scene: bool) -> Iterator[Pa
             tuple(dict.fromkeys(info.element for info in infos)),
             sum(info.stored_bytes for info in infos),
             tuple(_stale(context, prim, key, payload, scene)),
-            baked.camera_changes(context, prim, key, payload) if scene else (),
+            tuple(_notes(context, prim, key, payload, scene)),
         )
 
 
@@ -100,6 +100,15 @@ def _stale(context: Context, prim: Any, key: Key, payload: Any, scene: bool) -> 
     time = context.time if key.time is None else key.time
     for path, how in baked.painted_changes(context.stage, payload, time):
         yield f"painted surface {path} {how}"
-    yield from baked.parameters_changed(prim, key, payload, context.time)
+    if not baked.is_by_product(payload):
+        yield from baked.parameters_changed(prim, key, payload, context.time)
     if scene:
         yield from baked.stale_because(context, prim, key, payload)
+
+
+def _notes(context: Context, prim: Any, key: Key, payload: Any, scene: bool) -> Iterator[str]:
+    if baked.is_by_product(payload):
+        for change in baked.parameters_changed(prim, key, payload, context.time):
+            yield f"{change}; readers that do not know the operation show that"
+    if scene:
+        yield from baked.camera_changes(context, prim, key, payload)

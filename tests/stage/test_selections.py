@@ -416,7 +416,8 @@ stage = Usd.Stage.Open(sys.argv[1])
 stack, findings = read_edit_stack(stage, "/World/Edits", None, ["/World/near", "/World/far"])
 edit = stack.edits[0]
 limits = [limit_content(limit) for limit in edit.receivers.limits]
-found = {"casters": sorted(edit.casters.paths), "limits": limits, "lights": edit.lights, "target": edit.target, "digest": stack.digest}
+found = {"casters": sorted(edit.casters.paths), "limits": limits, "lights": edit.lights, "target": edit.target}
+found["digest"] = stack.digest
 print(json.dumps({"registered": schema.is_registered(), "findings": len(findings), **found}))
 """
 

@@ -39,6 +39,7 @@ RULES: tuple[Rule, ...] = (
     selections.RegionIsRendered(),
     selections.RegionWithoutSpace(),
     selections.UnshadowWithoutOccluders(),
+    selections.LightsWithoutEffect(),
     selections.SeveralTargets(),
     selections.LightIsNoLight(),
     edits.SeveralAnchors(),

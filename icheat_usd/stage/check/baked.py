@@ -65,14 +65,14 @@ class BakedForOtherCamera(Rule):
 
 
 class BakedParametersChanged(Rule):
-    doc = "What is baked was baked with the edit's operation and parameters as they are."
+    doc = "Rows were baked with the edit's operation and parameters as they are."
     severity = Severity.WARNING
 
     def find(self, context: Context) -> Found:
         for prim in context.edits:
             for key, payload in context.payloads(prim):
                 because = parameters_changed(prim, key, payload, context.time)
-                if because:
+                if because and not is_by_product(payload):
                     message = f"what is baked{_at(key)} is stale: {'; '.join(because)}; readers that do not know the"
                     yield prim, schema.PAYLOAD, f"{message} operation show the old; bake it again"
 
@@ -97,6 +97,14 @@ def has_baked_form(payload: Payload) -> bool:
     """Whether a reader that does not know the operation can apply the payload."""
     constants = (payload.scale_delta, payload.emission, payload.offset)
     return payload.rows is not None or any(value is not None for value in constants)
+
+
+def is_by_product(payload: Payload) -> bool:
+    """Whether all that is baked are constants that authoring stores by itself, of an operation that is known here.
+
+    A layer that overrides a parameter leaves them behind, as it should: that is no more than a note.
+    """
+    return payload.rows is None and operations.find(payload.operation) is not None
 
 
 def stale_because(context: Context, prim: Usd.Prim, key: Key, payload: Payload) -> tuple[str, ...]:

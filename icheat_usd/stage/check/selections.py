@@ -103,6 +103,19 @@ class UnshadowWithoutOccluders(Rule):
                 )
 
 
+class LightsWithoutEffect(Rule):
+    doc = "Lights narrow an edit whose operation can tell them apart."
+    severity = Severity.WARNING
+
+    def find(self, context: Context) -> Found:
+        for prim in context.edits:
+            name = schema.read_attribute(prim, schema.OPERATION, context.time)
+            operation = operations.find(name)
+            if operation is not None and operation.level is operations.Level.VIEW and targets(prim, schema.LIGHTS):
+                message = f"'{name}' acts on all light of its receivers, whichever lights it is from; remove the lights"
+                yield prim, schema.LIGHTS, message
+
+
 class SeveralTargets(Rule):
     doc = "An edit aims at one prim at most."
 
