@@ -14,8 +14,7 @@ def hash_u32(x: int) -> int:
     """PCG output hash of a 32-bit word (Jarzynski & Olano 2020, JCGT 9(3))."""
     state = np.uint32(np.uint32(x) * np.uint32(747796405) + np.uint32(2891336453))
     word = np.uint32(
-        np.uint32(np.uint32(state >> np.uint32((state >> np.uint32(28)) + np.uint32(4))) ^ state)
-        * np.uint32(277803737)
+        np.uint32(np.uint32(state >> np.uint32((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
     )
     return np.uint32(np.uint32(word >> np.uint32(22)) ^ word)
 
