@@ -76,7 +76,7 @@ def command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.authoring import named_edit, open_for_writing
     from icheat_usd.cli.progress import ProgressLine
     from icheat_usd.errors import EditError
-    from icheat_usd.session import baking, inspection
+    from icheat_usd.session import baking, flattening, inspection
     from icheat_usd.session.quality import PREVIEW
 
     stage, layer = open_for_writing(options)
@@ -90,7 +90,7 @@ def command(options: argparse.Namespace) -> int:
         if options.flatten:
             if options.edits:
                 raise EditError("--flatten freezes the whole stack; mute the edits that should not be in it instead")
-            done = baking.flatten_stack(
+            done = flattening.flatten_stack(
                 stage,
                 options.name,
                 layer=layer,

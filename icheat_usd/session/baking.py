@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +16,8 @@ from icheat_usd.edits.encodings.bake import (
     at_full_amount,
     bake_field,
     check_bakeable,
-    largest_error,
 )
 from icheat_usd.edits.encodings.choose import choose
-from icheat_usd.edits.encodings.pair_samples import PairSamples
 from icheat_usd.edits.facts import facts
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend, Edit, EditStack, Payload
@@ -28,7 +25,6 @@ from icheat_usd.edits.operations import Level, find
 from icheat_usd.errors import EditError
 from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import Bool, Finding
-from icheat_usd.session.authoring import anchor_of
 from icheat_usd.session.document import Session
 from icheat_usd.session.inspection import describe_stack
 from icheat_usd.session.keys import payload_at
@@ -36,7 +32,6 @@ from icheat_usd.session.origin import history_entry
 from icheat_usd.session.quality import PREVIEW, Quality
 from icheat_usd.sidecar import list_elements, write_payloads
 from icheat_usd.stage import authoring, key_authoring, layers
-from icheat_usd.stage.authoring import Members
 from icheat_usd.stage.edit_stack import anchor_path
 from icheat_usd.stage.keys import read_keys
 from icheat_usd.stage.stacks import EditFinding, edit_prim
@@ -44,9 +39,6 @@ from icheat_usd.transport import sum_lights
 
 #: Operation of an edit that is evaluated by what is baked.
 BAKED = "baked"
-
-#: Keys of a frozen stack are put no closer than this, in frames.
-_CLOSEST_KEYS = 1.0
 
 
 @dataclass(frozen=True)
@@ -73,7 +65,7 @@ class BakedKey:
 
 @dataclass(frozen=True)
 class Baked:
-    """What `bake_edits` and `flatten_stack` wrote."""
+    """What `bake_edits` and `flattening.flatten_stack` wrote."""
 
     keys: tuple[BakedKey, ...]
     findings: tuple[Finding, ...]
@@ -93,7 +85,9 @@ class Shot(NamedTuple):
 ANYTHING = Shot()
 
 
-class _Key(NamedTuple):
+class RowsAtKey(NamedTuple):
+    """What one key is to hold."""
+
     time: float | None
     payload: Payload
     baked: BakedRows
@@ -142,8 +136,8 @@ def bake_edits(
     beside = sidecar or target.realPath
     if not beside:
         raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
-    sessions = _Sessions(stage, shot, progress)
-    made: dict[str, list[_Key]] = {}
+    sessions = Sessions(stage, shot, progress)
+    made: dict[str, list[RowsAtKey]] = {}
     findings: list[Finding] = []
     for path in edits:
         made[path] = [_bake_key(sessions, path, time, epsilon, coefficients) for time in _times(stage, path, frames)]
@@ -151,134 +145,25 @@ def bake_edits(
     written: list[Path] = []
     keys: list[BakedKey] = []
     try:
-        with ExitStack() as all_or_none:
+        with layers.saving(stage, target):
             for path, parts in made.items():
                 payloads = [key.payload for key in parts]
                 anchor = anchor_path(edit_prim(stage, path))
                 file, digests = write_payloads(beside, payloads, anchor=anchor, history=history_entry(why, path))
                 written.append(file)
-                all_or_none.enter_context(layers.writing(stage, target, path))
                 for key, digest in zip(parts, digests, strict=True):
                     findings += key_authoring.set_payload_key(
                         stage, path, layer=target, time=key.time, payload=(file, digest)
                     )
-                    keys.append(_described(path, key, file, digest))
+                    keys.append(described(path, key, file, digest))
                 if forget_recipe:
                     findings += authoring.set_edit(stage, path, layer=target, operation=BAKED)
-            _save(target)
     except Exception:
         # Not after an interruption: the layer may have been saved already, and then names these files.
         for file in written:
             file.unlink(missing_ok=True)
         raise
     return Baked(tuple(keys), tuple(dict.fromkeys(findings)))
-
-
-def flatten_stack(
-    stage: Any,
-    name: str,
-    *,
-    layer: str,
-    shot: Shot = ANYTHING,
-    frames: Sequence[float] | None = None,
-    epsilon: float = EPSILON,
-    coefficients: int | None = None,
-    sidecar: str | Path | None = None,
-    why: str = "",
-    progress: Progress = silent,
-) -> Baked:
-    """Freeze a stack into one edit of operation "baked", mute what it was made of, and save the layer.
-
-    Edits that act on receivers after all others stay live behind it. Over
-    several frames, keys are put at the first and the last of them and, by
-    halving, wherever the rows in between are off by more than `epsilon`.
-
-    Parameters
-    ----------
-    name : str
-        Of the new edit's prim.
-    frames
-        Times that the result must hold at; otherwise one payload for all times.
-
-    Raises
-    ------
-    EditError, SidecarError, StageError
-        As `bake_edits`.
-    """
-    target = layers.find_layer(stage, layer)
-    beside = sidecar or target.realPath
-    if not beside:
-        raise EditError(f"layer '{layer}' has no file to put a sidecar beside; name one with --sidecar")
-    sessions = _Sessions(stage, shot, progress)
-    first = sessions.at(frames[0] if frames else None)
-    stack_path, stack = first.stack_path, first.stack
-    parts = [edit.path for edit in _pair_edits(stack).edits if edit.enabled] if stack.enabled else []
-    if stack_path is None or not parts:
-        raise EditError(f"{stack_path or 'the stage'} has no active edit to flatten; name another stack with --stack")
-    times: Sequence[float | None] = sorted(set(frames)) if frames else [None]
-    baked = {time: _bake_stack(sessions, time, stack_path, epsilon, coefficients) for time in {times[0], times[-1]}}
-    pending = [(times[0], times[-1])] if len(times) > 1 else []
-    while pending:
-        low, high = pending.pop()
-        assert low is not None and high is not None
-        inside = [time for time in times if time is not None and low + _CLOSEST_KEYS <= time <= high - _CLOSEST_KEYS]
-        if not inside:
-            continue
-        middle = min(inside, key=lambda time: abs(time - (low + high) / 2))
-        weight = (middle - low) / (high - low)
-        session, field = _stack_at(sessions, middle)
-        work = PairSamples(field, session.view, session.gather, *_light(session, field))
-        ends = [(found, share) for found, share in ((baked[low], 1 - weight), (baked[high], weight)) if found]
-        keys = [(found.rows, share) for found, share in ends]
-        allowed = max([epsilon, *(found.measured for found, _ in ends)])
-        if largest_error(work, keys, session.snapshot) > allowed:
-            baked[middle] = _bake_stack(sessions, middle, stack_path, epsilon, coefficients)
-            pending += [(low, middle), (middle, high)]
-    anchor = anchor_of(stage)
-    if not any(baked.values()):
-        raise EditError(f"{stack_path}: none of its edits does anything at these frames; choose others with --frames")
-    made = []
-    identity = []
-    for time, found in sorted(baked.items(), key=lambda item: (item[0] is not None, item[0] or 0.0)):
-        if found is None:
-            identity.append(time)
-            continue
-        facts_then = facts(sessions.at(time).snapshot, anchor)
-        made.append(_Key(time, Payload(BAKED, {}, rows=found.rows, made_against=facts_then), found))
-    file: Path | None = None
-    findings: list[Finding] = []
-    try:
-        history = history_entry(why, f"{stack_path}/{name}")
-        file, digests = write_payloads(beside, [key.payload for key in made], anchor=anchor, history=history)
-        with ExitStack() as all_or_none:
-            for place in (stack_path, *parts):
-                all_or_none.enter_context(layers.writing(stage, target, place))
-            path = authoring.add_edit(
-                stage,
-                stack_path,
-                name,
-                layer=target,
-                operation=BAKED,
-                receivers=Members((anchor,)),
-                casters=Members((anchor,)),
-                payload=(file, digests[0]),
-                time=made[0].time,
-            )
-            for key, digest in zip(made[1:], digests[1:], strict=True):
-                findings += key_authoring.set_payload_key(
-                    stage, path, layer=target, time=key.time, payload=(file, digest)
-                )
-            for time in identity:
-                findings += key_authoring.set_payload_key(stage, path, layer=target, time=time, payload=None)
-            for part in parts:
-                findings += authoring.set_edit(stage, part, layer=target, enabled=False)
-            _save(target)
-    except Exception:
-        if file is not None:
-            file.unlink(missing_ok=True)
-        raise
-    keys_written = tuple(_described(path, key, file, digest) for key, digest in zip(made, digests, strict=True))
-    return Baked(keys_written, tuple(dict.fromkeys(findings)))
 
 
 def bakeable_edits(stage: Any, stack: str) -> list[str]:
@@ -299,7 +184,7 @@ def bakeable_edits(stage: Any, stack: str) -> list[str]:
     return found
 
 
-class _Sessions:
+class Sessions:
     """A session for each frame that is baked at; the last two are kept, for what lies between."""
 
     def __init__(self, stage: Any, shot: Shot, progress: Progress) -> None:
@@ -333,7 +218,7 @@ def _times(stage: Any, path: str, frames: Sequence[float] | None) -> Sequence[fl
     return times or [None]
 
 
-def _bake_key(sessions: _Sessions, path: str, time: float | None, epsilon: float, coefficients: int | None) -> _Key:
+def _bake_key(sessions: Sessions, path: str, time: float | None, epsilon: float, coefficients: int | None) -> RowsAtKey:
     session = sessions.at(time)
     edit = next((edit for edit in session.stack.edits if edit.path == path), None)
     if edit is None:
@@ -341,11 +226,11 @@ def _bake_key(sessions: _Sessions, path: str, time: float | None, epsilon: float
     if find(edit.operation) is None:
         raise EditError(f"{path}: operation '{edit.operation}' is not known here, so nothing can be baked anew from it")
     field = bind(at_full_amount(edit), session.snapshot)
-    baked = _bake(session, field, path, epsilon, coefficients, _lights_of(edit, session))
+    baked = bake_rows(session, field, path, epsilon, coefficients, _lights_of(edit, session))
     anchor = anchor_path(edit_prim(session.stage, path))
     made_against = facts(session.snapshot, anchor, edit=edit)
     payload = payload_at(session.stage, path, time, made_against)
-    return _Key(time, replace(payload, rows=baked.rows, made_against=made_against), baked)
+    return RowsAtKey(time, replace(payload, rows=baked.rows, made_against=made_against), baked)
 
 
 def _lights_of(edit: Edit, session: Session) -> Bool:
@@ -355,32 +240,7 @@ def _lights_of(edit: Edit, session: Session) -> Bool:
     return np.asarray(acts[field.light_group], np.bool_)
 
 
-def _pair_edits(stack: EditStack) -> EditStack:
-    """The stack without edits that act on receivers alone, which come last wherever they stand."""
-    return replace(stack, edits=tuple(edit for edit in stack.edits if not _is_view(edit)))
-
-
-def _is_view(edit: Edit) -> bool:
-    operation = find(edit.operation)
-    return operation is not None and operation.level is Level.VIEW
-
-
-def _stack_at(sessions: _Sessions, time: float | None) -> tuple[Session, EditField]:
-    session = sessions.at(time)
-    return session, bind(_pair_edits(session.stack), session.snapshot)
-
-
-def _bake_stack(
-    sessions: _Sessions, time: float | None, where: str, epsilon: float, coefficients: int | None
-) -> BakedRows | None:
-    """Rows of a stack, None where none of its edits does anything at that time."""
-    session, field = _stack_at(sessions, time)
-    if field.is_identity:
-        return None
-    return _bake(session, field, where, epsilon, coefficients)
-
-
-def _bake(
+def bake_rows(
     session: Session,
     field: EditField,
     where: str,
@@ -388,8 +248,15 @@ def _bake(
     coefficients: int | None,
     lights: Bool | None = None,
 ) -> BakedRows:
+    """Rows of a field as a session's view and gather samples see it.
+
+    Raises
+    ------
+    EditError
+        Rows cannot hold what the field does.
+    """
     check_bakeable(field, where)
-    radiance, transport = _light(session, field, lights)
+    radiance, transport = light_for(session, field, lights)
     return bake_field(
         field,
         session.view,
@@ -404,7 +271,7 @@ def _bake(
     )
 
 
-def _light(session: Session, field: EditField, lights: Bool | None = None) -> tuple[Any, Any]:
+def light_for(session: Session, field: EditField, lights: Bool | None = None) -> tuple[Any, Any]:
     """Radiance of some lights, all by default, and transport; computed only where the field looks at light."""
     if not field.uses_incident and not field.aggregates:
         return None, None
@@ -413,7 +280,7 @@ def _light(session: Session, field: EditField, lights: Bool | None = None) -> tu
     return radiance, session.transport if field.aggregates else None
 
 
-def _warnings(sessions: _Sessions, path: str, keys: list[_Key], forget_recipe: bool) -> list[Finding]:
+def _warnings(sessions: Sessions, path: str, keys: list[RowsAtKey], forget_recipe: bool) -> list[Finding]:
     session = sessions.at(keys[0].time)
     edit = next(edit for edit in session.stack.edits if edit.path == path)
     operation = find(edit.operation)
@@ -437,7 +304,8 @@ def _warnings(sessions: _Sessions, path: str, keys: list[_Key], forget_recipe: b
     return found
 
 
-def _described(path: str, key: _Key, file: Path, digest: str) -> BakedKey:
+def described(path: str, key: RowsAtKey, file: Path, digest: str) -> BakedKey:
+    """What was written for one key."""
     rows = key.baked.rows
     operation = key.payload.operation
     return BakedKey(
@@ -458,8 +326,3 @@ def _described(path: str, key: _Key, file: Path, digest: str) -> BakedKey:
         measured_error=key.baked.measured,
         lost_radiance=key.baked.lost,
     )
-
-
-def _save(target: Any) -> None:
-    if not target.anonymous:
-        layers.save_layer(target)

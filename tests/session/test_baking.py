@@ -12,7 +12,8 @@ import pytest
 from icheat_usd.cli.program import run
 from icheat_usd.errors import EditError
 from icheat_usd.session import Quality, Session
-from icheat_usd.session.baking import Shot, bake_edits, bakeable_edits, flatten_stack
+from icheat_usd.session.baking import Shot, bake_edits, bakeable_edits
+from icheat_usd.session.flattening import flatten_stack
 from icheat_usd.session.keys import list_keys, set_key
 from icheat_usd.sidecar import read_payload
 from icheat_usd.stage import open_stage
