@@ -225,6 +225,9 @@ def _bake_key(sessions: Sessions, path: str, time: float | None, epsilon: float,
         raise EditError(f"{path}: is no edit of the stack {session.stack_path}; name another one with --stack")
     if find(edit.operation) is None:
         raise EditError(f"{path}: operation '{edit.operation}' is not known here, so nothing can be baked anew from it")
+    if any(key.payload is None and key.weight > 0 for key in edit.keys):
+        at = "" if time is None else f" at frame {time:g}"
+        raise EditError(f"{path}: is half way to the identity{at}, where it has no recipe to keep; bake it at its keys")
     field = bind(at_full_amount(edit), session.snapshot)
     baked = bake_rows(session, field, path, epsilon, coefficients, _lights_of(edit, session))
     anchor = anchor_path(edit_prim(session.stage, path))

@@ -317,7 +317,7 @@ class _Made:
         return replace(payload, **constants)  # type: ignore[arg-type]
 
     def _mixed_mask(self, side: str) -> SurfaceMask | None:
-        """The mask half way between those of the keys around: exact where they cover the same surfaces."""
+        """The mask between those of the keys around; with equal parameters at both it is what was there."""
         masks: Sequence[tuple[SurfaceMask | None, float]] = [(getattr(p, side), w) for p, w in self._payloads]
         if not masks:
             return None

@@ -85,7 +85,9 @@ def _named_stack(stage: Usd.Stage, stack: str) -> str:
             return str(path)
     paths = [str(prim.GetPath()) for prim in stack_prims(stage)]
     found = [path for path in paths if path.rpartition("/")[2] == stack]
-    if len(found) != 1:
+    if len(found) > 1:
+        raise EditError(f"{stage.GetRootLayer().identifier}: '{stack}' may be {', '.join(found)}; name it by its path")
+    if not found:
         known = f"it has {', '.join(paths)}" if paths else "make one with `icheat stack create`"
         raise EditError(f"{stage.GetRootLayer().identifier}: no stack '{stack}'; {known}")
     return found[0]

@@ -128,6 +128,14 @@ def test_what_cannot_be_baked_is_refused_and_nothing_is_left_behind(operations):
     assert sorted(p.name for p in operations.iterdir()) == files
 
 
+def test_what_is_half_way_to_the_identity_has_no_recipe_to_keep(operations):
+    stage = open_stage(operations / "falloff.usda")
+    set_key(stage, FALLOFF, layer="falloff.usda", frame=1, parameters={"exponent": 1.0})
+    set_key(stage, FALLOFF, layer="falloff.usda", frame=9, identity=True)
+    with pytest.raises(EditError, match="half way to the identity at frame 5"):
+        bake_edits(stage, [FALLOFF], layer="falloff.usda", shot=SHOT, frames=[5])
+
+
 def test_light_and_blend_are_warned_about(operations):
     stage = open_stage(operations / "hsv.usda")
     done = bake_edits(stage, ["/World/Edits/hsv"], layer="hsv.usda", shot=SHOT)
