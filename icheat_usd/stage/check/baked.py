@@ -44,11 +44,10 @@ class BakedStale(Rule):
     severity = Severity.WARNING
 
     def find(self, context: Context) -> Found:
-        for prim in context.edits:
-            for key, payload in context.payloads(prim):
-                because = stale_because(context, prim, key, payload)
-                if because:
-                    yield prim, schema.PAYLOAD, f"what is baked{_at(key)} is stale: {'; '.join(because)}; bake it again"
+        for prim, key, payload in context.all_payloads():
+            because = stale_because(context, prim, key, payload)
+            if because:
+                yield prim, schema.PAYLOAD, f"what is baked{_at(key)} is stale: {'; '.join(because)}; bake it again"
 
 
 class BakedForOtherCamera(Rule):
@@ -56,12 +55,11 @@ class BakedForOtherCamera(Rule):
     severity = Severity.WARNING
 
     def find(self, context: Context) -> Found:
-        for prim in context.edits:
-            for key, payload in context.payloads(prim):
-                because = camera_changes(context, prim, key, payload)
-                if because:
-                    message = f"rows{_at(key)} were sampled for what a camera saw, and {'; '.join(because)}"
-                    yield prim, schema.PAYLOAD, f"{message}; places that it did not see fade out: bake it again"
+        for prim, key, payload in context.all_payloads():
+            because = camera_changes(context, prim, key, payload)
+            if because:
+                message = f"rows{_at(key)} were sampled for what a camera saw, and {'; '.join(because)}"
+                yield prim, schema.PAYLOAD, f"{message}; places that it did not see fade out: bake it again"
 
 
 class BakedParametersChanged(Rule):
@@ -69,12 +67,11 @@ class BakedParametersChanged(Rule):
     severity = Severity.WARNING
 
     def find(self, context: Context) -> Found:
-        for prim in context.edits:
-            for key, payload in context.payloads(prim):
-                because = parameters_changed(prim, key, payload, context.time)
-                if because and not is_by_product(payload):
-                    message = f"what is baked{_at(key)} is stale: {'; '.join(because)}; readers that do not know the"
-                    yield prim, schema.PAYLOAD, f"{message} operation show the old; bake it again"
+        for prim, key, payload in context.all_payloads():
+            because = parameters_changed(prim, key, payload, context.time)
+            if because and not is_by_product(payload):
+                message = f"what is baked{_at(key)} is stale: {'; '.join(because)}; readers that do not know the"
+                yield prim, schema.PAYLOAD, f"{message} operation show the old; bake it again"
 
 
 class PaintedSurfaceChanged(Rule):
@@ -82,12 +79,11 @@ class PaintedSurfaceChanged(Rule):
     severity = Severity.WARNING
 
     def find(self, context: Context) -> Found:
-        for prim in context.edits:
-            for key, payload in context.payloads(prim):
-                time = context.time if key.time is None else key.time
-                for path, how in painted_changes(context.stage, payload, time):
-                    advice = "weights come from the nearest place that was painted; look at it, and paint again"
-                    yield prim, schema.PAYLOAD, f"painted surface {path} {how}; {advice}"
+        for prim, key, payload in context.all_payloads():
+            time = context.time if key.time is None else key.time
+            for path, how in painted_changes(context.stage, payload, time):
+                advice = "weights come from the nearest place that was painted; look at it, and paint again"
+                yield prim, schema.PAYLOAD, f"painted surface {path} {how}; {advice}"
 
 
 # --------------------------------------------------------------------------- what has changed

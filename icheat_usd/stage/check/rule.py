@@ -74,6 +74,12 @@ class Context:
             if payload is not None:
                 yield key, payload
 
+    def all_payloads(self) -> Iterator[tuple[Usd.Prim, Key, Payload]]:
+        """Every edit with each of its keys and payloads that can be read; see `payloads`."""
+        for prim in self.edits:
+            for key, payload in self.payloads(prim):
+                yield prim, key, payload
+
     def facts_at(self, prim: Usd.Prim, time: float | None, then: Mapping[str, str | float | int]) -> Facts | None:
         """What the scene and an edit's selections are like at a time, in full; None where they cannot be read.
 
