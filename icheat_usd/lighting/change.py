@@ -1,0 +1,178 @@
+"""Lights of a snapshot taken apart, changed, added and removed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from icheat_usd.errors import IcheatError
+from icheat_usd.scene import F32, LightKind, Lights, SceneSnapshot, Textures
+
+
+class LightError(IcheatError):
+    """A light cannot be changed the way that was asked for."""
+
+
+def one_light(snapshot: SceneSnapshot, light: int) -> SceneSnapshot:
+    """The scene with a single light, row `light`; everything else is shared with `snapshot`."""
+    lights = snapshot.lights
+    first, last = int(lights.triangle_begin[light]), int(lights.triangle_begin[light + 1])
+    row = slice(light, light + 1)
+    alone = Lights(
+        kind=lights.kind[row].copy(),
+        to_world=lights.to_world[row].copy(),
+        radiance=lights.radiance[row].copy(),
+        size=lights.size[row].copy(),
+        texture=lights.texture[row].copy(),
+        surface=lights.surface[row].copy(),
+        triangle_begin=np.array([0, last - first], np.int64),
+        triangle=lights.triangle[first:last].copy(),
+        triangle_instance=lights.triangle_instance[first:last].copy(),
+    )
+    return replace(snapshot, lights=alone, light_paths=(snapshot.light_paths[light],))
+
+
+def join_lights(snapshot: SceneSnapshot, alone: list[SceneSnapshot]) -> SceneSnapshot:
+    """The scene lit by the lights of `alone`, one-light snapshots, in their order; their images stand after its own."""
+    textures = snapshot.textures
+    parts = []
+    for part in alone:
+        lights = part.lights
+        if lights.texture[0] >= len(snapshot.textures.begin):
+            textures, row = append_texture(textures, texture_image(part.textures, int(lights.texture[0])))
+            lights = lights._replace(texture=np.array([row], np.int32))
+        parts.append(lights)
+    begin = np.concatenate([[0], np.cumsum([len(part.triangle) for part in parts])]).astype(np.int64)
+    empty = no_lights()
+    columns = {
+        name: np.concatenate([getattr(empty, name), *(getattr(part, name) for part in parts)])
+        for name in Lights._fields
+        if name != "triangle_begin"
+    }
+    paths = tuple(part.light_paths[0] for part in alone)
+    return replace(snapshot, textures=textures, lights=Lights(triangle_begin=begin, **columns), light_paths=paths)
+
+
+def no_lights() -> Lights:
+    """A table of lights without rows."""
+    return Lights(
+        kind=np.empty(0, np.int32),
+        to_world=np.empty((0, 3, 4), np.float32),
+        radiance=np.empty((0, 3), np.float32),
+        size=np.empty((0, 2), np.float32),
+        texture=np.empty(0, np.int32),
+        surface=np.empty(0, np.int32),
+        triangle_begin=np.zeros(1, np.int64),
+        triangle=np.empty(0, np.int32),
+        triangle_instance=np.empty(0, np.int32),
+    )
+
+
+def changed_light(
+    scene: SceneSnapshot,
+    alone: SceneSnapshot,
+    *,
+    to_world: ArrayLike | None = None,
+    radiance: ArrayLike | None = None,
+    size: ArrayLike | None = None,
+    texture: F32 | None = None,
+) -> SceneSnapshot:
+    """A one-light snapshot with some properties of its light replaced.
+
+    Parameters
+    ----------
+    scene : SceneSnapshot
+        What `alone` was taken from; its textures stay, a new image stands behind them.
+    to_world : (3, 4), metres, about the scene's centre
+    radiance : (3,), scene-linear
+    size : (2,), local; see `scene.Lights`
+    texture : (height, width, 3 or 4) float32, linear
+        For domes (lat-long) and rectangles; an array of size 0 takes the image away.
+
+    Raises
+    ------
+    LightError
+        A value has another shape or is not finite; the light consists of a mesh's triangles, whose place,
+        size and image belong to the mesh; its kind has no image.
+    """
+    lights, path = alone.lights, alone.light_paths[0]
+    kind = LightKind(int(lights.kind[0]))
+    if kind == LightKind.MESH and any(value is not None for value in (to_world, size, texture)):
+        raise LightError(
+            f"{path} is a mesh that glows: its place, size and image are the mesh's; only dim or recolour it"
+        )
+    columns: dict[str, np.ndarray] = {}
+    for name, value, shape in (("to_world", to_world, (3, 4)), ("radiance", radiance, (3,)), ("size", size, (2,))):
+        if value is not None:
+            columns[name] = _checked(path, name, value, shape)[None]
+    if texture is not None:
+        if kind not in (LightKind.DOME, LightKind.RECT):
+            raise LightError(f"{path} is a {kind.name.lower()} light; only domes and rectangles have an image")
+        if texture.size == 0:
+            columns["texture"] = np.array([-1], np.int32)
+        else:
+            if texture.ndim != 3 or texture.shape[2] not in (3, 4):
+                raise LightError(f"the image of {path} needs shape (height, width, 3 or 4), not {texture.shape}")
+            textures, row = append_texture(scene.textures, texture)
+            alone = replace(alone, textures=textures)
+            columns["texture"] = np.array([row], np.int32)
+    return replace(alone, lights=lights._replace(**columns))
+
+
+def _checked(path: str, name: str, value: ArrayLike, shape: tuple[int, ...]) -> F32:
+    array = np.array(value, np.float32)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise LightError(f"{name} of {path} needs finite numbers of shape {shape}, not {np.array(value).tolist()}")
+    return array
+
+
+def append_texture(textures: Textures, image: F32) -> tuple[Textures, int]:
+    """`textures` with one more image (height, width, 3 or 4), and its row."""
+    height, width, channels = image.shape
+    texels = np.ones((height * width, 4), np.float32)
+    texels[:, :channels] = image.reshape(-1, channels)
+    row = len(textures.begin)
+    grown = Textures(
+        texels=np.concatenate([textures.texels, texels]),
+        begin=np.append(textures.begin, len(textures.texels)).astype(np.int64),
+        width=np.append(textures.width, width).astype(np.int32),
+        height=np.append(textures.height, height).astype(np.int32),
+        wrap=np.concatenate([textures.wrap, np.zeros((1, 2), np.int32)]),
+    )
+    return grown, row
+
+
+def texture_image(textures: Textures, row: int) -> F32:
+    """Image `row` as (height, width, 4)."""
+    begin, width, height = int(textures.begin[row]), int(textures.width[row]), int(textures.height[row])
+    return textures.texels[begin : begin + width * height].reshape(height, width, 4)
+
+
+def new_light(
+    scene: SceneSnapshot,
+    path: str,
+    kind: LightKind,
+    *,
+    to_world: ArrayLike,
+    radiance: ArrayLike,
+    size: ArrayLike = (0.0, 0.0),
+    texture: F32 | None = None,
+) -> SceneSnapshot:
+    """A one-light snapshot of `scene` with a light that the stage does not have; see `changed_light`."""
+    if kind == LightKind.MESH:
+        raise LightError(f"{path}: a mesh light is geometry, which can't be added live; add it to the stage")
+    row = Lights(
+        kind=np.array([kind], np.int32),
+        to_world=np.zeros((1, 3, 4), np.float32),
+        radiance=np.zeros((1, 3), np.float32),
+        size=np.zeros((1, 2), np.float32),
+        texture=np.full(1, -1, np.int32),
+        surface=np.full(1, -1, np.int32),
+        triangle_begin=np.zeros(2, np.int64),
+        triangle=np.empty(0, np.int32),
+        triangle_instance=np.empty(0, np.int32),
+    )
+    alone = replace(scene, lights=row, light_paths=(path,))
+    return changed_light(scene, alone, to_world=to_world, radiance=radiance, size=size, texture=texture)

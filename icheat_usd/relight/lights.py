@@ -1,0 +1,176 @@
+"""The lights of one view while they are being changed: what each brings to gather cells and view samples."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
+from icheat_usd.lighting.change import LightError, changed_light, join_lights, new_light, one_light
+from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct
+from icheat_usd.scene import F32, LightKind, SceneSnapshot
+from icheat_usd.tracing import Tracer
+from icheat_usd.transport import Bounces, CellLight, solve_bounces, sum_lights
+
+_LIVE_SAMPLES = 1  # shadow rays per point and light while something moves
+
+
+@dataclass
+class _Light:
+    """One light: where it is, and how far its light has been worked out."""
+
+    alone: SceneSnapshot
+    rest: bool = False  #: whether radiance and direct light have their final quality
+
+
+class LiveLights:
+    """Light of every light at gathers and view, kept per light so that one light's change costs one light.
+
+    A change shows at once with few samples; `refine` brings it to the quality of `light_cells` and
+    `reflected_direct`. What is reached then depends on the light alone, not on how it got there.
+
+    Parameters
+    ----------
+    n_bounces : int
+        Diffuse reflections before the last one, as `solve_bounces`.
+    light_samples, dome_samples : int
+        Shadow rays per light and point at rest; domes get four times as many by default.
+    """
+
+    def __init__(
+        self,
+        snapshot: SceneSnapshot,
+        tracer: Tracer,
+        view: ViewSamples,
+        gather: GatherSamples,
+        bounces: Bounces,
+        *,
+        n_bounces: int = 16,
+        light_samples: int = 16,
+        dome_samples: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._scene, self._tracer, self._view, self._gather, self._bounces = snapshot, tracer, view, gather, bounces
+        self._n_bounces, self._seed = n_bounces, seed
+        self._light_samples, self._dome_samples = light_samples, dome_samples
+        self._lights = [_Light(one_light(snapshot, light)) for light in range(len(snapshot.lights.kind))]
+        n = len(self._lights)
+        self.gains: F32 = np.ones((n, 3), np.float32)  #: (n_lights, 3)
+        self.radiance: F32 = np.zeros((n, gather.n, 3), np.float32)  #: (n_lights, n_gather, 3) at gain 1
+        self.view_direct: F32 = np.zeros((n, view.n, 3), np.float32)  #: (n_lights, n_view, 3) at gain 1
+        for light in range(n):
+            self._show(light)
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """Scene path of each light."""
+        return tuple(light.alone.light_paths[0] for light in self._lights)
+
+    def snapshot(self) -> SceneSnapshot:
+        """The scene with the lights as they are now; gains are multiplied into their radiance."""
+        joined = join_lights(self._scene, [light.alone for light in self._lights])
+        return replace(joined, lights=joined.lights._replace(radiance=joined.lights.radiance * self.gains))
+
+    def total(self) -> F32:
+        """Radiance `b` that leaves each gather cell under the gains, (n_gather, 3)."""
+        return sum_lights(self.radiance * self.gains[:, None, :])
+
+    def direct(self) -> F32:
+        """Direct light that each view sample reflects under the gains, (n_view, 3)."""
+        return sum_lights(self.view_direct * self.gains[:, None, :])
+
+    def set_gain(self, light: int, rgb: ArrayLike) -> None:
+        """Dim or recolour: factor of what the light was when it was last changed."""
+        gain = np.broadcast_to(np.asarray(rgb, np.float32), (3,))
+        if not (np.isfinite(gain).all() and (gain >= 0.0).all()):
+            raise LightError(
+                f"the gain of {self.paths[self._checked(light)]} must be finite and not negative, not {rgb!r}"
+            )
+        self.gains[self._checked(light)] = gain
+
+    def change(
+        self,
+        light: int,
+        *,
+        to_world: ArrayLike | None = None,
+        radiance: ArrayLike | None = None,
+        size: ArrayLike | None = None,
+        texture: F32 | None = None,
+    ) -> None:
+        """Move, turn, resize one light or give it another colour or image; see `lighting.change.changed_light`.
+
+        Raises
+        ------
+        LightError
+            A value does not fit the light, or the light is a mesh, whose place is geometry.
+        """
+        state = self._lights[self._checked(light)]
+        state.alone = changed_light(
+            self._scene, state.alone, to_world=to_world, radiance=radiance, size=size, texture=texture
+        )
+        self._show(light)
+
+    def add(
+        self,
+        path: str,
+        kind: LightKind,
+        *,
+        to_world: ArrayLike,
+        radiance: ArrayLike,
+        size: ArrayLike = (0.0, 0.0),
+        texture: F32 | None = None,
+    ) -> int:
+        """Add a light behind the others; returns its number."""
+        alone = new_light(self._scene, path, kind, to_world=to_world, radiance=radiance, size=size, texture=texture)
+        self._lights.append(_Light(alone))
+        self.gains = np.concatenate([self.gains, np.ones((1, 3), np.float32)])
+        self.radiance = np.concatenate([self.radiance, np.zeros((1, self._gather.n, 3), np.float32)])
+        self.view_direct = np.concatenate([self.view_direct, np.zeros((1, self._view.n, 3), np.float32)])
+        self._show(len(self._lights) - 1)
+        return len(self._lights) - 1
+
+    def remove(self, light: int) -> None:
+        """Take a light away; those behind it move up by one."""
+        self._checked(light)
+        del self._lights[light]
+        self.gains = np.delete(self.gains, light, axis=0)
+        self.radiance = np.delete(self.radiance, light, axis=0)
+        self.view_direct = np.delete(self.view_direct, light, axis=0)
+
+    def refine(self) -> bool:
+        """Bring one light to its final quality; False when all have it."""
+        for light, state in enumerate(self._lights):
+            if not state.rest:
+                self._work_out(light, self._light_samples, self._dome_samples)
+                state.rest = True
+                break
+        return not all(state.rest for state in self._lights)
+
+    def cell_light(self) -> CellLight:
+        """What `Relighter` takes, from the present state; its `direct` is not kept and empty."""
+        return CellLight(np.zeros((len(self._lights), 0, 3), np.float32), self.radiance)
+
+    def _checked(self, light: int) -> int:
+        if not 0 <= light < len(self._lights):
+            raise LightError(f"there is no light {light}; the scene has {len(self._lights)}")
+        return light
+
+    def _show(self, light: int) -> None:
+        self._lights[light].rest = False
+        self._work_out(light, _LIVE_SAMPLES, _LIVE_SAMPLES)
+
+    def _work_out(self, light: int, n_samples: int, dome_samples: int | None) -> None:
+        alone, gather, view = self._lights[light].alone, self._gather, self._view
+        # By name, not by number: a light keeps its random numbers when others come or go.
+        seed = (self._seed + zlib.crc32(alone.light_paths[0].encode())) & 0x7FFFFFFF
+        sampler = build_light_sampler(alone, self._tracer, gather.patch_points, seed)
+        direct = cell_direct(alone, self._tracer, sampler, gather, n_samples, seed)
+        self.radiance[light] = solve_bounces(self._bounces, direct, self._n_bounces)[0]
+        sampler = build_light_sampler(alone, self._tracer, view.points, seed)
+        counts = samples_per_light(alone, n_samples, dome_samples)
+        self.view_direct[light] = reflected_direct(
+            alone, self._tracer, sampler, view.points, view.to_eye, seed, counts
+        )[0]

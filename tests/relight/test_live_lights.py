@@ -1,0 +1,188 @@
+"""Lights that change: one at a time, and the same in the end as if they had always been so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+
+from icheat_usd.lighting import build_light_sampler, reflected_direct
+from icheat_usd.lighting.change import LightError
+from icheat_usd.relight.lights import LiveLights
+from icheat_usd.scene import LightKind, SceneSnapshot
+from icheat_usd.transport import light_cells
+from tests.pipeline import Pipeline
+from tests.scenes import (
+    Image,
+    Light,
+    Material,
+    Mesh,
+    cornell_meshes,
+    look_at,
+    make_snapshot,
+    quad,
+    rotation,
+    translation,
+)
+
+
+def down(x: float, y: float, z: float) -> np.ndarray:
+    """A rect's frame that shines down from a place."""
+    return (translation(x, y, z) @ rotation((1, 0, 0), -90))[:3].astype(np.float32)
+
+
+def gradient_image() -> Image:
+    """A sky: bright at the horizon of one side."""
+    rows, columns = np.mgrid[0:8, 0:16]
+    level = 0.2 + rows / 8 * (1 + np.cos(columns / 16 * 2 * np.pi))
+    return Image(np.repeat(level[..., None], 3, axis=2).astype(np.float32))
+
+
+def build(pipeline: Pipeline, snapshot: SceneSnapshot | None = None, light_samples: int = 4) -> LiveLights:
+    return LiveLights(
+        snapshot or pipeline.snapshot,
+        pipeline.tracer,
+        pipeline.view,
+        pipeline.gather,
+        pipeline.bounces,
+        n_bounces=6,
+        light_samples=light_samples,
+        seed=3,
+    )
+
+
+def settle(lights: LiveLights) -> LiveLights:
+    for _ in range(1000):
+        if not lights.refine():
+            return lights
+    raise AssertionError("refine never ends")
+
+
+RECT = Light(LightKind.RECT, (5, 5, 5), down(0.3, 0.9, 0.0), (0.5, 0.4), path="/rect")
+SPHERE = Light(LightKind.SPHERE, (9, 2, 2), translation(-0.5, 0.3, 0.5)[:3], (0.1, 0.0), path="/sphere")
+DOME = Light(LightKind.DOME, (0.5, 0.6, 0.9), image=gradient_image(), path="/dome")
+
+
+def room(*lights: Light) -> SceneSnapshot:
+    """A Cornell box with a glowing lamp, these lights, and a pane of glass and a cut-out standing in it."""
+    pane = Mesh(
+        quad(0.8), Material(opacity=0.0, ior=1.5, roughness=0.0), transforms=[translation(0, 0.2, 0.5)], path="/pane"
+    )
+    lamp = Mesh(quad(0.4)[:, ::-1], Material(0.0, (8, 6, 3)), transforms=[translation(0, 0.99, 0)], path="/lamp")
+    floor = Mesh(quad(1.0, -0.98), Material(0.3, roughness=0.3, ior=1.5), path="/shiny")
+    camera = look_at((0, 0, 3.9), fov=39.3, width=16, height=12)
+    return make_snapshot([*cornell_meshes(), lamp, pane, floor], lights=lights, camera=camera)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Pipeline:
+    return Pipeline(room(RECT, SPHERE, DOME), n_gather=120, bounce_rays=64)
+
+
+def moved(light: Light) -> Light:
+    return replace(light, to_world=down(-0.4, 0.7, 0.2))
+
+
+def test_a_light_that_was_moved_about_ends_like_one_that_always_stood_there(scene: Pipeline) -> None:
+    lights = settle(build(scene))
+    lights.change(0, to_world=down(0.0, 0.2, 0.9))
+    lights.refine()
+    lights.change(0, to_world=down(-0.4, 0.7, 0.2), size=(0.5, 0.4))
+    moved_there = settle(lights)
+    there = settle(build(scene, room(moved(RECT), SPHERE, DOME)))
+    np.testing.assert_array_equal(moved_there.radiance, there.radiance)
+    np.testing.assert_array_equal(moved_there.view_direct, there.view_direct)
+
+
+def test_one_light_s_change_leaves_the_others_alone(scene: Pipeline) -> None:
+    lights = settle(build(scene))
+    radiance, direct = lights.radiance.copy(), lights.view_direct.copy()
+    lights.change(2, to_world=rotation((0, 1, 0), 70)[:3])
+    assert not np.array_equal(lights.radiance[2], radiance[2])
+    for other in (0, 1, 3):
+        np.testing.assert_array_equal(lights.radiance[other], radiance[other])
+        np.testing.assert_array_equal(lights.view_direct[other], direct[other])
+
+
+def test_lights_come_and_go(scene: Pipeline) -> None:
+    lights = settle(build(scene))
+    before = lights.total()
+    number = lights.add(
+        "/new", LightKind.DISTANT, to_world=rotation((1, 0, 0), 30)[:3], radiance=(3, 3, 3), size=(0.05, 0)
+    )
+    lights.remove(0)
+    assert lights.paths == ("/sphere", "/dome", "/lamp", "/new") and number == 4
+    settle(lights)
+    new = Light(LightKind.DISTANT, (3, 3, 3), rotation((1, 0, 0), 30)[:3], (0.05, 0), path="/new")
+    fresh = settle(build(scene, room(SPHERE, DOME, new)))
+    order = [fresh.paths.index(path) for path in lights.paths]
+    np.testing.assert_array_equal(lights.radiance, fresh.radiance[order])
+    np.testing.assert_array_equal(lights.view_direct, fresh.view_direct[order])
+    assert not np.array_equal(lights.total(), before)
+
+
+def test_gains_multiply_what_a_light_brings(scene: Pipeline) -> None:
+    lights = build(scene)
+    lights.set_gain(1, (0.5, 0, 2))
+    factors = np.ones((4, 1, 3), np.float32)
+    factors[1, 0] = 0.5, 0, 2
+    np.testing.assert_allclose(lights.total(), (lights.radiance * factors).sum(0), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(lights.direct(), (lights.view_direct * factors).sum(0), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(lights.snapshot().lights.radiance[1], (4.5, 0, 4))
+
+
+def test_at_rest_the_light_is_that_of_the_slow_way(scene: Pipeline) -> None:
+    """Different random numbers, the same expectation: sums over many samples agree."""
+    lights = build(scene, light_samples=64)
+    lights.change(0, to_world=down(-0.4, 0.7, 0.2))
+    settle(lights)
+    snapshot = lights.snapshot()
+    cells = light_cells(snapshot, scene.tracer, scene.gather, scene.bounces, n_bounces=6, light_samples=64)
+    sampler = build_light_sampler(snapshot, scene.tracer, scene.view.points)
+    direct = reflected_direct(snapshot, scene.tracer, sampler, scene.view.points, scene.view.to_eye, 5, 256)
+    area = scene.gather.area[:, None]
+    for light in range(4):
+        np.testing.assert_allclose(
+            (lights.radiance[light] * area).sum(0), (cells.radiance[light] * area).sum(0), rtol=0.04
+        )
+        np.testing.assert_allclose(lights.view_direct[light].mean(0), direct[light].mean(0), rtol=0.06)
+
+
+def test_any_number_of_threads_gives_the_same_light(scene: Pipeline) -> None:
+    threads = numba.get_num_threads()
+    both = settle(build(scene))
+    try:
+        numba.set_num_threads(1)
+        alone = settle(build(scene))
+    finally:
+        numba.set_num_threads(threads)
+    np.testing.assert_array_equal(both.radiance, alone.radiance)
+    np.testing.assert_array_equal(both.view_direct, alone.view_direct)
+
+
+def test_what_cannot_be_changed_says_so(scene: Pipeline) -> None:
+    lights = build(scene)
+    with pytest.raises(LightError, match="/lamp is a mesh"):
+        lights.change(3, to_world=down(0, 0, 0))
+    with pytest.raises(LightError, match="no light 9"):
+        lights.remove(9)
+    with pytest.raises(LightError, match="only domes and rectangles"):
+        lights.change(1, texture=np.ones((2, 2, 3), np.float32))
+    with pytest.raises(LightError, match="finite"):
+        lights.change(0, size=(np.nan, 1))
+    with pytest.raises(LightError, match="not negative"):
+        lights.set_gain(0, -1.0)
+    with pytest.raises(LightError, match="can't be added live"):
+        lights.add("/m", LightKind.MESH, to_world=down(0, 0, 0), radiance=(1, 1, 1))
+
+
+def test_a_new_image_replaces_the_old_one(scene: Pipeline) -> None:
+    lights = settle(build(scene))
+    image = np.full((4, 8, 3), 2.0, np.float32)
+    lights.change(2, texture=image)
+    settle(lights)
+    plain = settle(build(scene, room(RECT, SPHERE, replace(DOME, image=Image(image)))))
+    np.testing.assert_array_equal(lights.view_direct[2], plain.view_direct[2])
+    np.testing.assert_array_equal(lights.snapshot().lights.texture, [-1, -1, 1, -1])
