@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+# What tests compute must not be found by the next run, and must not fill a user's disk.
+os.environ["ICHEAT_CACHE_SIZE"] = "0"
+
 
 @pytest.fixture(scope="session")
 def shared_scenes() -> Path:

@@ -3,7 +3,9 @@
 Numba's on-disk cache only looks at the file a kernel stands in: after a change
 to a helper in another file it keeps serving the old machine code. Each kernel
 is therefore cached in a folder named by the contents of its own module and of
-every kernel module that it imports, so a stale kernel cannot be found.
+every kernel module that it imports, constants included, and by all that turns
+source into machine code (Python, NumPy, Numba, LLVM, the processor, Numba's
+options), so a stale kernel cannot be found.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import ast
 import functools
 import hashlib
 import os
-import sys
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -21,58 +23,87 @@ from typing import Any, TypeVar, cast
 # slower; on idle cores it cost a final gather 8 % and the transport nothing. Read when OpenMP loads, before numba.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+import llvmlite  # noqa: E402
+import llvmlite.binding  # noqa: E402
 import numba  # noqa: E402
+import numpy as np  # noqa: E402
+
+from icheat_usd.resources import cache_folder  # noqa: E402
 
 _KERNELS = Path(__file__).parent
 _PACKAGE = "icheat_usd.kernels"
+
+#: Options of Numba that change what it compiles; all others are about messages and places.
+_OPTIONS = ("CPU_NAME", "CPU_FEATURES", "OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "ENABLE_AVX", "BOUNDSCHECK")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def cache_directory() -> Path:
     """Folder for compiled kernels: ``$ICHEAT_CACHE_DIR``, else the user's cache folder."""
-    if configured := os.environ.get("ICHEAT_CACHE_DIR"):
-        return Path(configured) / "kernels"
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home()))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "icheat_usd" / "kernels"
+    return cache_folder("kernels")
 
 
-def _imported_kernel_modules(source: str) -> set[str]:
+def _imported_kernel_modules(source: str, package: str = _PACKAGE) -> set[str]:
+    """Names of the kernel modules that a kernel module may import, however it says so."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            if node.module == _PACKAGE:
+        if isinstance(node, ast.ImportFrom):
+            # Kernel modules lie in one folder: a relative import from there can only start with one dot.
+            module = ".".join(part for part in (package if node.level else "", node.module or "") if part)
+            if module == package:
                 names.update(alias.name for alias in node.names)
-            elif node.module.startswith(_PACKAGE + "."):
-                names.add(node.module.removeprefix(_PACKAGE + "."))
+            elif module.startswith(package + "."):
+                names.add(module.removeprefix(package + "."))
+        elif isinstance(node, ast.Import):
+            paths = (alias.name for alias in node.names)
+            names.update(path.removeprefix(package + ".") for path in paths if path.startswith(package + "."))
     return names
 
 
 @functools.cache
-def _closure_digest(module: str) -> str:
-    digest = hashlib.sha256(numba.__version__.encode())
-    pending, seen = [module], set()
+def compiler_facts() -> str:
+    """Everything but the source that machine code depends on, as text."""
+    options = [f"{name}={getattr(numba.config, name, None)}" for name in _OPTIONS]
+    features = llvmlite.binding.get_host_cpu_features().flatten()
+    facts = (
+        platform.python_implementation(),
+        platform.python_version(),
+        platform.machine(),
+        np.__version__,
+        numba.__version__,
+        llvmlite.__version__,
+        llvmlite.binding.get_process_triple(),
+        llvmlite.binding.get_host_cpu_name(),
+        features,
+        *options,
+    )
+    return "\n".join(facts)
+
+
+def closure_digest(module: str, folder: Path = _KERNELS, facts: str | None = None) -> str:
+    """Digest of a kernel module, of all kernel modules behind it, and of `compiler_facts`."""
+    digest = hashlib.sha256((compiler_facts() if facts is None else facts).encode())
+    pending, sources = [module], dict[str, bytes]()
     while pending:
         name = pending.pop()
-        path = _KERNELS / f"{name}.py"
-        if name in seen or not path.exists():
+        path = folder / f"{name}.py"
+        if name in sources or not path.exists():
             continue
-        seen.add(name)
-        pending.extend(sorted(_imported_kernel_modules(path.read_text())))
-    for name in sorted(seen):
-        digest.update(name.encode() + (_KERNELS / f"{name}.py").read_bytes())
+        sources[name] = path.read_bytes()
+        pending.extend(sorted(_imported_kernel_modules(sources[name].decode())))
+    for name in sorted(sources):
+        digest.update(f"{name} {len(sources[name])}\n".encode() + sources[name])
     return digest.hexdigest()[:16]
+
+
+_digest_of_module = functools.cache(closure_digest)
 
 
 def _compile(function: Function, **options: Any) -> Function:
     module = function.__module__.rpartition(".")[2]
     previous = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(cache_directory() / _closure_digest(module))
+    numba.config.CACHE_DIR = str(cache_directory() / _digest_of_module(module))
     try:
         return cast(Function, numba.njit(cache=True, nogil=True, **options)(function))
     finally:
@@ -90,3 +121,11 @@ def parallel_kernel(function: Function) -> Function:
     No sums across iterations: the same bits for any number of threads.
     """
     return _compile(function, parallel=True)
+
+
+def kernels_may_overlap() -> bool:
+    """Whether several threads may run parallel kernels at once: with Numba's own pool of workers they may not."""
+    try:
+        return str(numba.threading_layer()) in ("omp", "tbb")
+    except ValueError:  # No parallel kernel has run yet.
+        return False

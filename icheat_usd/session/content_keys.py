@@ -1,0 +1,146 @@
+"""Names for what is computed, made of everything it depends on: equal keys, equal results.
+
+Frames, sessions and processes that would compute the same thing find it by its key. A key covers the arrays of the
+scene, the settings, and the source of every module that takes part, so that neither an edited stage nor a new version
+of this package can be served what was made by another.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import icheat_usd
+from icheat_usd.kernels._jit import compiler_facts
+from icheat_usd.scene import LightKind, Lights, SceneSnapshot
+from icheat_usd.session.quality import Quality
+
+#: Raised when the meaning of a kept part changes without a change of the sources below.
+_FORMAT = 1
+
+#: Packages whose source decides what is computed.
+_PACKAGES = ("kernels", "materials", "tracing", "lighting", "samples", "transport")
+
+
+@dataclass(frozen=True)
+class ShotKeys:
+    """Keys of one frame seen by one camera, at one quality."""
+
+    scene: str  #: geometry, materials and their textures: what rays meet
+    view: str
+    gather: str
+    bounces: str
+    transport: str
+    lights: str  #: the lights alone
+    cell_light: str
+    view_light: str
+
+
+def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKeys:
+    """Keys of everything that is computed from a snapshot."""
+    scene = digest(
+        _FORMAT,
+        code_digest(),
+        engine,
+        snapshot.geometry,
+        [(s.path, s.instance_id, s.part) for s in snapshot.surfaces],
+        snapshot.materials._replace(texture=np.sign(snapshot.materials.texture)),
+        _images(snapshot, snapshot.materials.texture.ravel()),
+    )
+    camera = asdict(snapshot.camera)
+    for unused in ("path", "exposure_scale"):
+        del camera[unused]
+    sight = digest(scene, camera, quality.samples_per_pixel, quality.seed)
+    lights, domes = (_lights(snapshot, only) for only in (None, LightKind.DOME))
+    gather = digest("gather", sight, quality.n_gather)
+    bounces = digest("bounces", gather, quality.rays_per_bounce_row)
+    transport = digest("transport", gather, *_transport_settings(quality))
+    cell_light = digest("cell light", bounces, lights, quality.n_bounces, quality.light_samples)
+    view_light = digest("view light", sight, lights, quality.light_samples, quality.dome_samples)
+    view = digest("view", sight, domes)  # the sky behind the scene is part of the view
+    return ShotKeys(scene, view, gather, bounces, transport, lights, cell_light, view_light)
+
+
+def _transport_settings(quality: Quality) -> tuple[Any, ...]:
+    """All settings but those that other keys hold, or that come after the transport."""
+    elsewhere = {"n_gather", "rays_per_bounce_row", "light_samples", "dome_samples", "n_bounces", "samples_per_pixel"}
+    return tuple((name, value) for name, value in asdict(quality).items() if name not in elsewhere)
+
+
+def _lights(snapshot: SceneSnapshot, kind: LightKind | None) -> str:
+    lights = snapshot.lights
+    which = np.arange(len(lights.kind)) if kind is None else np.flatnonzero(lights.kind == kind)
+    spans = [
+        (lights.triangle[begin:end], lights.triangle_instance[begin:end])
+        for begin, end in zip(lights.triangle_begin[which], lights.triangle_begin[which + 1], strict=True)
+    ]
+    per_light = ("kind", "to_world", "radiance", "size", "surface")
+    columns = [getattr(lights, name)[which] for name in per_light]
+    return digest(snapshot.radius, columns, spans, _images(snapshot, lights.texture[which]))
+
+
+def light_digest(lights: Lights, row: int) -> str:
+    """Key of what one analytic light is, apart from its image."""
+    return digest(*(getattr(lights, name)[row] for name in ("kind", "to_world", "radiance", "size", "texture")))
+
+
+def _images(snapshot: SceneSnapshot, rows: Iterable[int]) -> list[Any]:
+    """Each image in `rows`, in that order; -1 is none."""
+    textures = snapshot.textures
+    known: dict[int, str] = {}
+    for row in {int(row) for row in rows if row >= 0}:
+        size = int(textures.width[row]), int(textures.height[row])
+        begin = int(textures.begin[row])
+        known[row] = digest(size, textures.wrap[row], textures.texels[begin : begin + size[0] * size[1]])
+    return [known.get(int(row), "") for row in rows]
+
+
+@functools.cache
+def code_digest() -> str:
+    """Digest of the sources that compute what is kept, and of what compiles them; about 5 ms, once."""
+    root = Path(icheat_usd.__file__).parent
+    found = hashlib.sha256(compiler_facts().encode())
+    for path in sorted([root / "scene.py", *(file for name in _PACKAGES for file in (root / name).glob("*.py"))]):
+        source = path.read_bytes()
+        found.update(f"{path.relative_to(root).as_posix()} {len(source)}\n".encode() + source)
+    return found.hexdigest()[:32]
+
+
+def digest(*values: Any) -> str:
+    """128 bits (hex) of numbers, texts, arrays, and tuples, lists, dicts, dataclasses or named tuples of such.
+
+    Raises
+    ------
+    TypeError
+        Something is none of these: what cannot be told apart must not share a key.
+    """
+    found = hashlib.blake2b(digest_size=16)
+    _feed(found, values)
+    return found.hexdigest()
+
+
+def _feed(found: Any, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        found.update(f"array {value.dtype.str} {value.shape}:".encode())
+        found.update(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data if value.size else b"")
+    elif value is None or isinstance(value, (bool, int, float, str, np.generic)):
+        text = value if isinstance(value, str) else repr(value)
+        found.update(f"{type(value).__name__} {len(text)}:{text}".encode())
+    elif is_dataclass(value) and not isinstance(value, type):
+        _feed(found, {name: getattr(value, name) for name in value.__dataclass_fields__})
+    elif isinstance(value, (tuple, list)):
+        found.update(f"{len(value)} values:".encode())
+        for part in value:
+            _feed(found, part)
+    elif isinstance(value, dict):
+        found.update(f"{len(value)} names:".encode())
+        for name, part in value.items():
+            _feed(found, (name, part))
+    else:
+        raise TypeError(f"a {type(value).__name__} has no digest")

@@ -1,0 +1,99 @@
+"""The kernel cache never serves code that another source, library or processor would not have made."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from icheat_usd.kernels import _jit
+
+PACKAGE = Path(_jit.__file__).parent
+
+CALLER = """
+from icheat_usd.kernels import helper
+from icheat_usd.kernels._jit import kernel
+
+@kernel
+def answer():
+    return helper.twice(helper.NUMBER)
+"""
+HELPER = """
+from icheat_usd.kernels._jit import kernel
+
+NUMBER = {number}
+
+@kernel
+def twice(x):
+    return {factor} * x
+"""
+
+
+def answer_of(root: Path, number: int, factor: int) -> tuple[int, int]:
+    """What the kernel says in a process of its own, and how many compiled kernels it found in the cache."""
+    (root / "icheat_usd" / "kernels" / "helper.py").write_text(HELPER.format(number=number, factor=factor))
+    code = "from icheat_usd.kernels.caller import answer; print(answer(), sum(answer.stats.cache_hits.values()))"
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(root), "ICHEAT_CACHE_DIR": str(root / "cache")},
+        cwd=root,
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr
+    value, hits = result.stdout.split()
+    return int(value), int(hits)
+
+
+def test_a_changed_constant_or_helper_in_another_file_is_seen_and_the_same_source_is_not_compiled_again(
+    tmp_path: Path,
+) -> None:
+    kernels = tmp_path / "icheat_usd" / "kernels"
+    kernels.mkdir(parents=True)
+    for package in (kernels.parent, kernels):
+        (package / "__init__.py").touch()
+    shutil.copy(PACKAGE / "_jit.py", kernels)
+    for name in ("resources.py", "errors.py"):
+        shutil.copy(PACKAGE.parent / name, kernels.parent)
+    (kernels / "caller.py").write_text(CALLER)
+    assert answer_of(tmp_path, 10, 2) == (20, 0)
+    assert answer_of(tmp_path, 10, 2) == (20, 1)
+    assert answer_of(tmp_path, 11, 2) == (22, 0)
+    assert answer_of(tmp_path, 11, 3) == (33, 0)
+    assert answer_of(tmp_path, 10, 2) == (20, 1)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from icheat_usd.kernels import helper",
+        "from icheat_usd.kernels import helper as other",
+        "from icheat_usd.kernels.helper import twice",
+        "import icheat_usd.kernels.helper",
+        "import icheat_usd.kernels.helper as other",
+        "from . import helper",
+        "from .helper import twice",
+        "def f():\n    from icheat_usd.kernels.helper import twice",
+    ],
+)
+def test_every_way_to_import_a_helper_counts(tmp_path: Path, line: str) -> None:
+    (tmp_path / "caller.py").write_text(line)
+    (tmp_path / "helper.py").write_text("from icheat_usd.kernels import deeper")
+    (tmp_path / "deeper.py").write_text("x = 1")
+    before = _jit.closure_digest("caller", tmp_path)
+    (tmp_path / "deeper.py").write_text("x = 2")
+    assert _jit.closure_digest("caller", tmp_path) != before
+
+
+def test_libraries_options_and_the_processor_are_in_the_digest() -> None:
+    facts = _jit.compiler_facts()
+    llvmlite = pytest.importorskip("llvmlite")
+    numpy = pytest.importorskip("numpy")
+    for part in (numpy.__version__, llvmlite.__version__, "CPU_NAME", "OPT=", sys.version.split()[0].rstrip("+")):
+        assert part in facts
+    assert _jit.closure_digest("rows", facts=facts) == _jit.closure_digest("rows")
+    assert _jit.closure_digest("rows", facts=facts + "+avx9") != _jit.closure_digest("rows")
