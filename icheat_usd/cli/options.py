@@ -161,4 +161,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def file_size(n: int) -> str:
     """Bytes as people read them."""
-    return f"{n} B" if n < 1000 else f"{n / 1000:.3g} kB" if n < 999_500 else f"{n / 1e6:.3g} MB"
+    if n < 999_500:
+        return f"{n} B" if n < 1000 else f"{n / 1000:.3g} kB"
+    return f"{n / 1e6:.3g} MB" if n < 999_500_000 else f"{n / 1e9:.3g} GB"

@@ -37,6 +37,7 @@ VERBS = (
     "upgrade",
     "gc",
     "history",
+    "cache",
 )
 
 CLEAN, FINDINGS, FAILURE, INTERRUPTED = 0, 1, 2, 130

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from icheat_usd.edits.field import EditField
-from icheat_usd.errors import EditError, SampleSetMismatch
+from icheat_usd.errors import SampleSetMismatch
 from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight.editing import LitCasters, edit_view
-from icheat_usd.relight.receivers import Receivers, group_receivers
+from icheat_usd.relight.receivers import Receivers, behind_occluders, group_receivers
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -47,16 +47,7 @@ class Relighter:
     def receivers(self, field: EditField) -> Receivers:
         """What `relight` needs to know about where the edits land; keep it while only amounts or lights change."""
         receivers = group_receivers(field, self.view)
-        if not field.throughs:
-            return receivers
-        if self.held_back is None:
-            raise EditError("the edit stack lets light pass occluders: give build_relighter a HeldBack")
-        lobes = []
-        for edit in field.throughs:
-            masks = receivers.ends.masks[field.rows_of(edit)]
-            reached = receivers.samples[(masks > 0).any(axis=0)]
-            lobes.append(self.held_back.rows(reached, field.edits[edit].occluders))
-        return replace(receivers, held_back=tuple(lobes))
+        return behind_occluders(field, receivers, self.held_back)
 
     def relight(self, field: EditField, gains: F32 | None = None, receivers: Receivers | None = None) -> RelitView:
         """Light of every view sample under the edits.
@@ -102,6 +93,25 @@ def _weighted_sum(per_light: F32, gains: F32 | None) -> F32:
     return sum_lights(per_light if gains is None else per_light * gains[:, None, :])
 
 
+def light_view(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    view: ViewSamples,
+    *,
+    light_samples: int = 16,
+    dome_samples: int | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> F32:
+    """Direct light that the view samples reflect, (n_lights, n_view, 3); see `build_relighter`."""
+    progress("light the view samples", 0.0)
+    sampler = build_light_sampler(snapshot, tracer, view.points, seed)
+    counts = samples_per_light(snapshot, light_samples, dome_samples)
+    direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, counts)
+    progress("light the view samples", 1.0)
+    return direct
+
+
 def build_relighter(
     snapshot: SceneSnapshot,
     tracer: Tracer,
@@ -124,10 +134,14 @@ def build_relighter(
     dome_samples : int, optional
         The same for domes; four times `light_samples` by default.
     """
-    progress("light the view samples", 0.0)
-    sampler = build_light_sampler(snapshot, tracer, view.points, seed)
-    counts = samples_per_light(snapshot, light_samples, dome_samples)
-    direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, counts)
-    progress("light the view samples", 1.0)
+    direct = light_view(
+        snapshot,
+        tracer,
+        view,
+        light_samples=light_samples,
+        dome_samples=dome_samples,
+        seed=seed,
+        progress=progress,
+    )
     held_back = HeldBack(snapshot, tracer, view, gather, transport, progress)
     return Relighter(view, gather, transport, direct, cell_light, held_back)

@@ -50,11 +50,20 @@ def size_limit() -> int:
         The variable holds no size.
     """
     text = os.environ.get("ICHEAT_CACHE_SIZE", "").strip()
-    if not text:
-        return DEFAULT_SIZE
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)I?B?", text.upper())
+    return parse_size(text, "ICHEAT_CACHE_SIZE") if text else DEFAULT_SIZE
+
+
+def parse_size(text: str, where: str) -> int:
+    """Bytes, as people write them.
+
+    Raises
+    ------
+    IcheatError
+        It is no size; the message begins with `where`.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)I?B?", text.strip().upper())
     if match is None:
-        raise IcheatError(f"ICHEAT_CACHE_SIZE is '{text}', which is no size such as 20G or 500M; 0 turns the cache off")
+        raise IcheatError(f"{where} is '{text}', which is no size such as 20G or 500M; 0 keeps nothing")
     return int(float(match[1]) * _UNITS[match[2]])
 
 

@@ -16,25 +16,24 @@ from icheat_usd.errors import EditError, StageError
 from icheat_usd.final_gather import GatherSettings, final_gather
 from icheat_usd.image.film import Film
 from icheat_usd.progress import Progress, silent
-from icheat_usd.relight import Relighter, build_relighter
-from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
 from icheat_usd.scene import Finding, SceneSnapshot
 from icheat_usd.session import authoring, films, keys
+from icheat_usd.session.disk_cache import DiskCache
 from icheat_usd.session.quality import FINAL, PREVIEW, Quality
+from icheat_usd.session.shot_parts import Memory, ShotParts
 from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
 from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.stage.stacks import find_stack
-from icheat_usd.tracing import Tracer, build_tracer
-from icheat_usd.transport import CellLight, Transport, build_bounces, build_transport, light_cells
 
 
-class Session:
+class Session(ShotParts):
     """One stage seen by one camera at one time, with one edit stack.
 
     Make one with `Session.open`. What is expensive (snapshot, samples,
-    transport) is made when first needed and kept: edits are read anew each
-    time, but after a change of geometry, lights or camera open a new session.
+    transport) is made when first needed and kept, on disk too where it takes
+    seconds: edits are read anew each time, but after a change of geometry,
+    lights or camera open a new session.
     """
 
     def __init__(
@@ -49,15 +48,15 @@ class Session:
         quality: Quality,
         tracer: str,
         progress: Progress,
+        disk: DiskCache | None = None,
+        memory: Memory | None = None,
     ) -> None:
+        super().__init__(quality, engine=tracer, progress=progress, disk=disk, memory=memory)
         self.stage = stage
         self.camera = camera
         self.frame = frame
-        self.quality = quality
-        self.progress = progress
         self._stack_path = stack
         self._size = (width, height)
-        self._engine = tracer
 
     @classmethod
     def open(
@@ -72,6 +71,8 @@ class Session:
         quality: Quality = PREVIEW,
         tracer: str = "embree",
         progress: Progress = silent,
+        disk: DiskCache | None = None,
+        memory: Memory | None = None,
     ) -> Session:
         """Open a stage.
 
@@ -86,6 +87,10 @@ class Session:
             Prim path of the edit stack; otherwise found as the stage says.
         width, height : int, optional
             Pixels; otherwise the render settings' resolution.
+        disk : DiskCache, optional
+            Where expensive parts are kept; by default in the user's cache folder, as ``$ICHEAT_CACHE_SIZE`` says.
+        memory : Memory, optional
+            Where sessions at other frames of the stage find parts that are the same.
 
         Raises
         ------
@@ -104,9 +109,9 @@ class Session:
             quality=quality,
             tracer=tracer,
             progress=progress,
+            disk=disk,
+            memory=memory,
         )
-
-    # What is computed, each part once
 
     @cached_property
     def snapshot(self) -> SceneSnapshot:
@@ -122,74 +127,6 @@ class Session:
                 f" check visibility, purpose and the frame{' (' + reasons + ')' if reasons else ''}"
             )
         return snapshot
-
-    @cached_property
-    def tracer(self) -> Tracer:
-        return build_tracer(self.snapshot, self._engine)
-
-    @cached_property
-    def view(self) -> ViewSamples:
-        self.progress("place view samples", 0.0)
-        quality = self.quality
-        return view_samples(self.snapshot, self.tracer, samples_per_pixel=quality.samples_per_pixel, seed=quality.seed)
-
-    @cached_property
-    def gather(self) -> GatherSamples:
-        self.progress("place gather samples", 0.0)
-        return gather_samples(self.snapshot, self.tracer, self.view, n=self.quality.n_gather, seed=self.quality.seed)
-
-    @cached_property
-    def transport(self) -> Transport:
-        quality = self.quality
-        return build_transport(
-            self.snapshot,
-            self.tracer,
-            self.view,
-            self.gather,
-            rays_per_row=quality.rays_per_row,
-            row_spacing=quality.row_spacing,
-            seed=quality.seed,
-            progress=self.progress,
-        )
-
-    @cached_property
-    def cell_light(self) -> CellLight:
-        """Light that leaves the gather samples, of all bounces but the last."""
-        quality = self.quality
-        bounces = build_bounces(
-            self.snapshot,
-            self.tracer,
-            self.gather,
-            rays_per_row=quality.rays_per_bounce_row,
-            seed=quality.seed,
-            progress=self.progress,
-        )
-        return light_cells(
-            self.snapshot,
-            self.tracer,
-            self.gather,
-            bounces,
-            n_bounces=quality.n_bounces,
-            light_samples=quality.light_samples,
-            seed=quality.seed,
-            progress=self.progress,
-        )
-
-    @cached_property
-    def relighter(self) -> Relighter:
-        quality = self.quality
-        return build_relighter(
-            self.snapshot,
-            self.tracer,
-            self.view,
-            self.gather,
-            self.transport,
-            self.cell_light,
-            light_samples=quality.light_samples,
-            dome_samples=quality.dome_samples,
-            seed=quality.seed,
-            progress=self.progress,
-        )
 
     # Edits
 

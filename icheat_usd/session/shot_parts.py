@@ -1,0 +1,200 @@
+"""Everything that a preview of one frame is made of, each part computed once, or found where it was kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, Protocol, TypeVar, cast
+
+from icheat_usd.progress import Progress, silent
+from icheat_usd.relight import Relighter
+from icheat_usd.relight.relighter import light_view
+from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
+from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.session.content_keys import ShotKeys, shot_keys
+from icheat_usd.session.disk_cache import DiskCache, Shelf
+from icheat_usd.session.quality import Quality
+from icheat_usd.tracing import Tracer, build_tracer
+from icheat_usd.transport import Bounces, CellLight, HeldBack, Transport, build_bounces, build_transport, light_cells
+
+Part = TypeVar("Part")
+
+#: What takes less time to make than this is not kept on disk: reading it back would take as long.
+WORTH_KEEPING_SECONDS = 1.0
+
+
+class Memory(Protocol):
+    """Keeps parts that several frames share; see `frames.SharedParts`."""
+
+    def get(self, kind: str, key: str, make: Callable[[], Part]) -> Part:
+        """The part of this key, made if it is not there."""
+
+
+class ShotParts:
+    """One camera at one time: samples, transport and light; `snapshot` is given or overridden.
+
+    Parameters
+    ----------
+    disk : DiskCache, optional
+        Where expensive parts are found again by another session; by default as the environment says.
+    memory : Memory, optional
+        Where other frames find parts that are the same.
+    """
+
+    def __init__(
+        self,
+        quality: Quality,
+        *,
+        snapshot: SceneSnapshot | None = None,
+        engine: str = "embree",
+        progress: Progress = silent,
+        disk: DiskCache | None = None,
+        memory: Memory | None = None,
+    ) -> None:
+        self.quality = quality
+        self.progress = progress
+        self._engine = engine
+        self._disk = DiskCache() if disk is None else disk
+        self._memory = memory
+        if snapshot is not None:
+            self.__dict__["snapshot"] = snapshot
+
+    @cached_property
+    def snapshot(self) -> SceneSnapshot:
+        """What is rendered."""
+        raise NotImplementedError
+
+    @cached_property
+    def keys(self) -> ShotKeys:
+        """Names of the parts by what they depend on."""
+        return shot_keys(self.snapshot, self.quality, self._engine)
+
+    @cached_property
+    def tracer(self) -> Tracer:
+        if self._memory is None:
+            return build_tracer(self.snapshot, self._engine)
+        return self._memory.get("tracer", self.keys.scene, lambda: build_tracer(self.snapshot, self._engine))
+
+    @cached_property
+    def view(self) -> ViewSamples:
+        def make(_: Shelf | None) -> ViewSamples:
+            self.progress("place view samples", 0.0)
+            n, seed = self.quality.samples_per_pixel, self.quality.seed
+            return view_samples(self.snapshot, self.tracer, samples_per_pixel=n, seed=seed)
+
+        return self._kept("view", ("tracer",), make)
+
+    @cached_property
+    def gather(self) -> GatherSamples:
+        def make(_: Shelf | None) -> GatherSamples:
+            n, seed = self.quality.n_gather, self.quality.seed
+            self.progress("place gather samples", 0.0)
+            return gather_samples(self.snapshot, self.tracer, self.view, n=n, seed=seed)
+
+        return self._kept("gather", ("view",), make)
+
+    @cached_property
+    def transport(self) -> Transport:
+        def make(_: Shelf | None) -> Transport:
+            quality = self.quality
+            return build_transport(
+                self.snapshot,
+                self.tracer,
+                self.view,
+                self.gather,
+                rays_per_row=quality.rays_per_row,
+                row_spacing=quality.row_spacing,
+                seed=quality.seed,
+                progress=self.progress,
+            )
+
+        return self._kept("transport", ("gather",), make)
+
+    @cached_property
+    def bounces(self) -> Bounces:
+        """Light from gather samples to gather samples."""
+
+        def make(_: Shelf | None) -> Bounces:
+            rays, seed = self.quality.rays_per_bounce_row, self.quality.seed
+            return build_bounces(
+                self.snapshot, self.tracer, self.gather, rays_per_row=rays, seed=seed, progress=self.progress
+            )
+
+        return self._kept("bounces", ("gather",), make)
+
+    @cached_property
+    def cell_light(self) -> CellLight:
+        """Light that leaves the gather samples, of all bounces but the last."""
+
+        def make(_: Shelf | None) -> CellLight:
+            quality = self.quality
+            return light_cells(
+                self.snapshot,
+                self.tracer,
+                self.gather,
+                self.bounces,
+                n_bounces=quality.n_bounces,
+                light_samples=quality.light_samples,
+                seed=quality.seed,
+                progress=self.progress,
+            )
+
+        return self._kept("cell_light", ("bounces",), make)
+
+    @cached_property
+    def view_light(self) -> F32:
+        """Direct light that the view samples reflect, (n_lights, n_view, 3)."""
+
+        def make(_: Shelf | None) -> F32:
+            quality = self.quality
+            return light_view(
+                self.snapshot,
+                self.tracer,
+                self.view,
+                light_samples=quality.light_samples,
+                dome_samples=quality.dome_samples,
+                seed=quality.seed,
+                progress=self.progress,
+            )
+
+        return self._kept("view_light", ("view",), make)
+
+    @cached_property
+    def relighter(self) -> Relighter:
+        held_back = HeldBack(self.snapshot, self.tracer, self.view, self.gather, self.transport, self.progress)
+        return Relighter(self.view, self.gather, self.transport, self.view_light, self.cell_light, held_back)
+
+    def _kept(self, kind: str, needs: Sequence[str], make: Callable[[Shelf | None], Part]) -> Part:
+        """A part from memory, else from disk, else made. `make` gets a shelf for the pieces of a long build."""
+        if self._memory is not None:
+            return self._memory.get(kind, getattr(self.keys, kind), lambda: self._from_disk(kind, needs, make))
+        return self._from_disk(kind, needs, make)
+
+    def _from_disk(self, kind: str, needs: Sequence[str], make: Callable[[Shelf | None], Part]) -> Part:
+        if not self._disk.is_on:
+            return make(None)
+        shelf = self._disk.shelf(kind, getattr(self.keys, kind), self._about())
+        found = shelf.load("whole")
+        if found is not None:
+            return cast(Part, found)
+        # First, so that their time does not count.
+        for name in needs:
+            getattr(self, name)
+        began = time.perf_counter()
+        made = make(shelf)
+        if time.perf_counter() - began > WORTH_KEEPING_SECONDS:
+            shelf.save("whole", made)
+            shelf.drop(*(name for name in shelf.names() if name != "whole"))
+        return made
+
+    def _about(self) -> dict[str, Any]:
+        """For people who look at the cache."""
+        camera = self.snapshot.camera
+        return {
+            "stage": self.snapshot.stage_path,
+            "camera": camera.path,
+            "frame": self.snapshot.time_code,
+            "width": camera.width,
+            "height": camera.height,
+        }
