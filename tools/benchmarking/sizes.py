@@ -13,44 +13,6 @@ from typing import Any
 import numpy as np
 
 
-def made_up_edits(session: Any) -> dict[str, Any]:
-    """Edits of objects and of brushes between what the camera sees most of, and what it is lit by most."""
-    from icheat_usd.edits.model import Edit, KeyedPayload, Payload, Selection
-    from icheat_usd.edits.painting import paint_mask, soft_sphere
-
-    snapshot, view, gather = session.snapshot, session.view, session.gather
-    surface = snapshot.geometry.instance_surface
-    seen = np.bincount(surface[view.points.instance], minlength=len(snapshot.surfaces))
-    sending = np.bincount(surface[gather.points.instance], minlength=len(snapshot.surfaces))
-    receivers = [snapshot.surfaces[i].path for i in np.argsort(-seen)[:4]]
-    casters = [snapshot.surfaces[i].path for i in np.argsort(-sending)[:8]]
-
-    def one(name: str, operation: str, parameters: dict[str, Any], us: list[str], ws: list[str]) -> Any:
-        return Edit(f"/{name}", operation, parameters, Selection(frozenset(us)), Selection(frozenset(ws)))
-
-    def painted(edit: Any, side: str) -> Any:
-        points = view.points if side == "receiver_mask" else gather.points
-        paths = edit.receivers.paths if side == "receiver_mask" else edit.casters.paths
-        on = np.isin(surface[points.instance], [i for i, s in enumerate(snapshot.surfaces) if s.path in paths])
-        position = points.position[on]
-        radius = 0.5 * float(np.linalg.norm(position.std(axis=0)) + 1e-3)
-        centre = tuple(float(x) for x in np.median(position, axis=0))
-        mask = paint_mask(snapshot, paths, soft_sphere(centre, 0.3 * radius, 2 * radius))
-        payload = edit.keys[0].payload if edit.keys else Payload(edit.operation, edit.parameters)
-        return replace(edit, keys=(KeyedPayload(replace(payload, **{side: mask}), 1.0),))
-
-    brush = painted(
-        one("brush", "scale", {"gain": 2.0, "color": (1.0, 0.8, 0.6)}, receivers[:2], casters[:2]), "receiver_mask"
-    )
-    return {
-        "object scale": one("objects", "scale", {"gain": 0.5}, receivers, casters),
-        "object hsv": one("hue", "hsv", {"hue": 40.0, "saturation": 1.5}, receivers, casters[:4]),
-        "brush scale": painted(brush, "caster_mask"),
-        "brush hsv": painted(one("dab", "hsv", {"hue": -60.0}, receivers[:2], casters[:2]), "receiver_mask"),
-        "falloff": one("falloff", "falloff", {"exponent": 1.0}, receivers[:1], casters[:2]),
-    }
-
-
 def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
     """Bake made-up edits of one stage in all ways; one line each."""
     from icheat_usd.edits.binding import bind
@@ -61,6 +23,7 @@ def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
     from icheat_usd.edits.operations.constants import baked_constants
     from icheat_usd.session import Quality, Session
     from icheat_usd.sidecar import write_payloads
+    from tools.benchmarking.made_up_edits import edits_of_objects_and_brushes
 
     stage = arguments.stages[0]
     size = {"width": arguments.width, "height": arguments.height}
@@ -89,7 +52,7 @@ def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
             ),
         }
 
-    for name, edit in made_up_edits(session).items():
+    for name, edit in edits_of_objects_and_brushes(session).items():
         if arguments.edits and name not in arguments.edits:
             continue
         operation = find(edit.operation)

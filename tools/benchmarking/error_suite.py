@@ -1,0 +1,67 @@
+"""Suite `errors`: every stage under the test lights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tools.benchmarking.errors import ErrorSettings, measure_errors, overview
+from tools.benchmarking.parts import Effort, Parts
+from tools.benchmarking.test_lights import choose_lights, with_lights
+
+QUICK = ErrorSettings(
+    pixels=60, rays=256, record_pixels=30, record_rays=128, edit_pixels=30, hit_pixels=8, hit_rays=64, n_bounces=3
+)
+
+
+def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
+    """One per stage, and one in the mode for quality where there is one."""
+    return [{"stage": stage} for stage in stages]
+
+
+def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
+    """Errors of one stage."""
+    parts = Parts(case["stage"], effort)
+    lights = choose_lights(parts.snapshot, parts.tracer, parts.view)
+    under = parts.under(with_lights(parts.snapshot, lights))
+    found = measure_errors(under, QUICK if quick else ErrorSettings(), folder)
+    for light in lights:
+        found["lights"][light.name]["what"] = light.note
+    return found
+
+
+def markdown(results: list[dict[str, Any]]) -> list[str]:
+    """Tables for README."""
+    lines = [
+        "| stage, light | compression and interpolation | total | largest pixel | cells against true hits |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    found = {result["case"]["name"]: result["result"] for result in results if "result" in result}
+    for stage, result in found.items():
+        for name, light in result["lights"].items():
+            lossy = light.get("interpolation_and_packing") or light.get("packing")
+            hits = result.get("cells_against_true_hits", {}).get(name)
+            lines.append(
+                f"| {stage}, {name} | {_percent(lossy)} | {_percent(light['total'])} |"
+                f" {100 * light['total']['largest']:.0f} % | {_percent(hits)} |"
+            )
+    if found:
+        figures = overview(found)
+        lines.append(
+            f"| median; worst | {_both(figures, 'interpolation_and_packing')} | {_both(figures, 'total')} | | |"
+        )
+    lines += ["", "| stage, edit | of the unedited light | error of the change |", "| --- | ---: | ---: |"]
+    for stage, result in found.items():
+        for name, edit in result["edits"].items():
+            lines.append(f"| {stage}, {name} | {100 * edit['of_unedited']:.1f} % | {_percent(edit['change'])} |")
+    return lines
+
+
+def _percent(error: dict[str, float] | None) -> str:
+    return "" if error is None else f"{100 * error['rms']:.1f} ± {100 * error['standard_error']:.1f} %"
+
+
+def _both(figures: dict[str, float], kind: str) -> str:
+    if f"{kind}_median" not in figures:
+        return ""
+    return f"{100 * figures[f'{kind}_median']:.1f} %; {100 * figures[f'{kind}_worst']:.1f} %"

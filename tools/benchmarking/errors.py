@@ -1,0 +1,303 @@
+"""Errors of the preview against a converged gather, light by light and edit by edit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.edits.binding import bind
+from icheat_usd.edits.model import Edit, EditStack
+from icheat_usd.final_gather.gatherer import Gatherer, gathered_light
+from icheat_usd.lighting import build_light_sampler
+from icheat_usd.materials import take_points
+from icheat_usd.relight import Relighter
+from icheat_usd.scene import F32
+from icheat_usd.transport import CellLight, build_bounces, light_cells
+from tools.benchmarking.converged import (
+    Probe,
+    choose_pixels,
+    converged_products,
+    converged_transport,
+    points_with_eye,
+    records_of,
+    view_of,
+)
+from tools.benchmarking.error_images import write_error_image, write_signed_image
+from tools.benchmarking.made_up_edits import edits_of_objects_and_brushes, one_edit, ranked_paths
+from tools.benchmarking.parts import Parts
+from tools.benchmarking.statistics import RelativeError, relative_error, relative_error_of_halves
+
+
+@dataclass(frozen=True)
+class ErrorSettings:
+    """Effort of the reference."""
+
+    pixels: int = 2000  #: one out of each block of the image
+    rays: int = 16_384  #: per pixel and lobe, each of two halves
+    record_pixels: int = 500  #: of these pixels, for the part of interpolation
+    record_rays: int = 2048  #: per record, each of two halves
+    edit_pixels: int = 500
+    hit_pixels: int = 200  #: for the comparison with light at true hits
+    hit_rays: int = 1024
+    n_bounces: int = 16
+    seed: int = 20_061
+
+
+@dataclass(frozen=True)
+class References:
+    """Two independent estimates of everything, by light."""
+
+    probe: Probe
+    same_b: tuple[F32, F32]  #: (n_lights, n_pixels, 3) each: converged rows times the preview's own `b`
+    own_b: tuple[F32, F32]  #: the same rows times `b` of seeds of their own
+    b: tuple[F32, F32]  #: (n_lights, n_gather, 3) each
+
+
+def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -> dict[str, Any]:
+    """All errors of one scene under the lights of its snapshot; images go to `folder`."""
+    names = [path.rpartition("/")[2] for path in parts.snapshot.light_paths]
+    started = time.perf_counter()
+    parts.refine_lights()
+    references = converged_references(parts, settings)
+    found: dict[str, Any] = {
+        "settings": settings.__dict__,
+        "pixels": len(references.probe.pixel),
+        "lights": {name: {} for name in names},
+        "reference_seconds": time.perf_counter() - started,
+    }
+    for light, name in enumerate(names):
+        found["lights"][name] = _of_light(parts, references, light)
+    for name, error in _interpolation(parts, references, settings, names):
+        found["lights"][name] |= error
+    found["edits"] = _of_edits(parts, references, settings)
+    if settings.hit_pixels:
+        found["cells_against_true_hits"] = _against_true_hits(parts, references, settings, names)
+    if folder is not None:
+        found["images"] = _images(parts, references, names, folder)
+    found["seconds"] = time.perf_counter() - started
+    return found
+
+
+def converged_references(parts: Parts, settings: ErrorSettings) -> References:
+    """Two halves with seeds of their own all the way: rows, bounces and light."""
+    probe = choose_pixels(parts.view, settings.pixels, settings.seed)
+    view = view_of(parts.view, probe.samples)
+    own = parts.lights.radiance
+    same, other, radiance = [], [], []
+    for half in (1, 2):
+        seed = settings.seed + 1000 * half
+        bounces = build_bounces(parts.snapshot, parts.tracer, parts.gather, seed=seed)
+        b = light_cells(
+            parts.snapshot, parts.tracer, parts.gather, bounces, n_bounces=settings.n_bounces, seed=seed
+        ).radiance
+        both = np.concatenate([own, b])
+        products = converged_products(parts.snapshot, parts.tracer, parts.gather, view, settings.rays, seed, both)
+        pixels = np.stack([probe.to_pixels(product) for product in products])
+        same.append(pixels[: len(own)])
+        other.append(pixels[len(own) :])
+        radiance.append(b)
+    return References(probe, (same[0], same[1]), (other[0], other[1]), (radiance[0], radiance[1]))
+
+
+def _of_light(parts: Parts, references: References, light: int) -> dict[str, Any]:
+    """Total error at frame rate, and where it comes from."""
+    probe, b = references.probe, parts.lights.radiance[light]
+    packed = probe.to_pixels(parts.packed.to_view(b)[probe.samples])
+    found = {
+        "total": relative_error(packed, references.own_b[0][light], references.own_b[1][light]),
+        "transport": relative_error(packed, references.same_b[0][light], references.same_b[1][light]),
+        "cell_light": relative_error_of_halves(
+            references.same_b[0][light],
+            references.same_b[1][light],
+            references.own_b[0][light],
+            references.own_b[1][light],
+        ),
+    }  # fmt: skip
+    if parts.transport is not None:
+        exact = probe.to_pixels(parts.transport.to_view(b)[probe.samples])
+        found["packing"] = _difference(packed, exact, references, light)
+        found["rest"] = relative_error(exact, references.own_b[0][light], references.own_b[1][light])
+    return {name: error.as_dict() for name, error in found.items()}
+
+
+def _difference(image: F32, exact: F32, references: References, light: int) -> RelativeError:
+    """Of two images that both are known, over the light of the reference."""
+    a, b = references.same_b[0][light], references.same_b[1][light]
+    change = image.astype(np.float64) - exact
+    return relative_error_of_halves(a + change, b + change, a, b)
+
+
+def _interpolation(
+    parts: Parts, references: References, settings: ErrorSettings, names: list[str]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What interpolation alone loses, and with packing: rows at the records as converged as those at the pixels."""
+    transport = parts.transport
+    if transport is None or transport.interpolation is None:
+        return
+    probe = references.probe.part(settings.record_pixels, settings.seed)
+    kept = np.flatnonzero(np.isin(references.probe.pixel, probe.pixel))
+    needed = records_of(transport.interpolation, probe.samples)
+    own = parts.lights.radiance
+    here = take_points(parts.view.points, probe.samples)
+    halves = []
+    for half in (3, 4):
+        at = points_with_eye(parts.view, transport, needed.records)
+        # Tints belong to the samples, so products at the records are wanted without those of the records.
+        lobes = _lobe_products(parts, at, settings.record_rays, settings.seed + 1000 * half, own)
+        tints = [here.albedo, here.specular, here.specular_edge]
+        halves.append(
+            [
+                probe.to_pixels(needed.to_samples([products[light] for products in lobes], tints[: len(lobes)]))
+                for light in range(len(own))
+            ]
+        )
+    for light, name in enumerate(names):
+        a, b = references.same_b[0][light][kept], references.same_b[1][light][kept]
+        packed, exact = (
+            probe.to_pixels(operator.to_view(own[light])[probe.samples]) for operator in (parts.packed, transport)
+        )
+        lost = packed - exact
+        yield (
+            name,
+            {
+                "interpolation": relative_error_of_halves(halves[0][light], halves[1][light], a, b).as_dict(),
+                "interpolation_and_packing": relative_error_of_halves(
+                    halves[0][light] + lost, halves[1][light] + lost, a, b
+                ).as_dict(),
+            },
+        )
+
+
+def _lobe_products(parts: Parts, view: Any, n_rays: int, seed: int, radiance: F32) -> list[F32]:
+    """Products of converged rows with every light's radiance, lobe by lobe: (n_lights, n, 3) each."""
+    n_lobes = len(parts.transport.lobes) if parts.transport is not None else 1
+    out = [np.zeros((len(radiance), view.n, 3), np.float32) for _ in range(n_lobes)]
+    for first in range(0, view.n, 512):
+        part = np.arange(first, min(first + 512, view.n))
+        rows = converged_transport(
+            parts.snapshot, parts.tracer, parts.gather, view_of(view, part), n_rays, seed + 7919 * (1 + first)
+        )
+        for lobe, into in zip(rows.lobes, out, strict=False):
+            for light, b in enumerate(radiance):
+                into[light, part] = lobe.rows.matmul(b)
+    return out
+
+
+def error_edits(parts: Parts) -> dict[str, Edit]:
+    """Edits whose effect is compared."""
+    edits = edits_of_objects_and_brushes(parts)
+    receivers, casters = (paths[:n] for paths, n in zip(ranked_paths(parts), (4, 8), strict=True))
+    edits["gamma"] = one_edit("gamma", "gamma", {"gamma": 0.7}, receivers, casters)
+    return edits
+
+
+def _of_edits(parts: Parts, references: References, settings: ErrorSettings) -> dict[str, Any]:
+    """Error of what each edit changes, under all lights at equal strength, over what it changes."""
+    probe = references.probe.part(settings.edit_pixels, settings.seed + 1)
+    view = view_of(parts.view, probe.samples)
+    strength = np.sqrt((references.own_b[0] ** 2).mean(axis=(1, 2)))
+    gains = np.repeat((1 / np.maximum(strength, 1e-20))[:, None], 3, axis=1).astype(np.float32)
+    evaluators = []
+    for half in (0, 1):
+        rows = converged_transport(
+            parts.snapshot, parts.tracer, parts.gather, view, settings.rays, settings.seed + 1000 * (5 + half)
+        )
+        cells = CellLight(references.b[half], references.b[half])
+        dark = np.zeros((len(gains), view.n, 3), np.float32)
+        evaluators.append(Relighter(view, parts.gather, rows, dark, cells))
+    found = {}
+    for name, edit in error_edits(parts).items():
+        field = bind(EditStack("/edit", (edit,)), parts.snapshot)
+        changes = []
+        for evaluator in evaluators:
+            lit = evaluator.relight(field, gains)
+            changes.append(probe.to_pixels(lit.indirect_edited - lit.indirect))
+        unedited = [probe.to_pixels(evaluator.transport.to_view(evaluator.radiance(gains))) for evaluator in evaluators]
+        shown = parts.edit_change(EditStack("/edit", (edit,)), gains)[probe.samples]
+        error = relative_error(probe.to_pixels(shown), changes[0], changes[1])
+        share = np.sqrt((changes[0] * changes[1]).mean() / (unedited[0] * unedited[1]).mean())
+        found[name] = {"change": error.as_dict(), "of_unedited": float(share)}
+    return found
+
+
+def _against_true_hits(
+    parts: Parts, references: References, settings: ErrorSettings, names: list[str]
+) -> dict[str, Any]:
+    """What the cells themselves cost: converged rows of cells against paths that are lit where they hit."""
+    probe = references.probe.part(settings.hit_pixels, settings.seed + 2)
+    kept = np.flatnonzero(np.isin(references.probe.pixel, probe.pixel))
+    view = view_of(parts.view, probe.samples)
+    found = {}
+    for light, name in enumerate(names):
+        alone = one_light_of(parts, light)
+        sampler = build_light_sampler(alone, parts.tracer, parts.gather.patch_points, settings.seed)
+        gatherer = Gatherer(
+            alone, parts.tracer, sampler, settings.hit_rays, settings.n_bounces, bind(EditStack("/none", ()), alone),
+            None, (),
+        )  # fmt: skip
+        stream = np.arange(view.n, dtype=np.int64)
+        halves = [probe.to_pixels(_in_chunks(gatherer, view, stream, settings.seed + 77 * half)) for half in (1, 2)]
+        a, b = (reference[light][kept] for reference in references.own_b)
+        found[name] = relative_error_of_halves(a, b, halves[0], halves[1]).as_dict()
+    return found
+
+
+def _in_chunks(gatherer: Gatherer, view: Any, stream: Any, seed: int) -> F32:
+    at_once = max(1, (1 << 18) // gatherer.n_rays)
+    out = np.empty((view.n, 3), np.float32)
+    for first in range(0, view.n, at_once):
+        part = slice(first, min(first + at_once, view.n))
+        points = take_points(view.points, part)
+        out[part] = gathered_light(gatherer, points, np.ascontiguousarray(view.to_eye[part]), stream[part], seed).base
+    return out
+
+
+def one_light_of(parts: Parts, light: int) -> Any:
+    """The scene under one of its lights; a test light, so no mesh."""
+    lights = parts.snapshot.lights
+    kept = slice(light, light + 1)
+    alone = lights._replace(
+        kind=lights.kind[kept], to_world=lights.to_world[kept], radiance=lights.radiance[kept],
+        size=lights.size[kept], texture=lights.texture[kept], surface=lights.surface[kept],
+        triangle_begin=np.zeros(2, np.int64),
+    )  # fmt: skip
+    return replace(parts.snapshot, lights=alone, light_paths=parts.snapshot.light_paths[kept])
+
+
+def _images(parts: Parts, references: References, names: list[str], folder: Path) -> list[str]:
+    """The error at every probed pixel, and what packing loses at every pixel; 8 % of the light is full colour."""
+    written = []
+    probe = references.probe
+    for light, name in enumerate(names):
+        b = parts.lights.radiance[light]
+        shown = parts.packed.to_view(b)
+        reference = (references.own_b[0][light] + references.own_b[1][light]) / 2
+        root = float(np.sqrt(max((references.own_b[0][light] * references.own_b[1][light]).mean(), 1e-30)))
+        off = (probe.to_pixels(shown[probe.samples]) - reference) / root
+        written.append(write_error_image(folder / f"{parts.name}_{name}_total.png", off, probe))
+        if parts.transport is not None:
+            lost = (shown - parts.transport.to_view(b)) / root
+            written.append(write_signed_image(folder / f"{parts.name}_{name}_packing.png", lost, parts.view))
+        written.append(
+            write_signed_image(folder / f"{parts.name}_{name}_light.png", shown / root, parts.view, shown=True)
+        )
+    return written
+
+
+def overview(found: dict[str, Any]) -> dict[str, float]:
+    """Median and worst over the lights of several scenes: ``{stage: measure_errors(...)}``."""
+    figures: dict[str, float] = {}
+    for kind in ("total", "rest", "transport", "packing", "interpolation", "interpolation_and_packing", "cell_light"):
+        values = [light[kind]["rms"] for stage in found.values() for light in stage["lights"].values() if kind in light]
+        if values:
+            figures[f"{kind}_median"] = float(np.median(values))
+            figures[f"{kind}_worst"] = float(np.max(values))
+    changes = [edit["change"]["rms"] for stage in found.values() for edit in stage["edits"].values()]
+    if changes:
+        figures["edits_median"], figures["edits_worst"] = float(np.median(changes)), float(np.max(changes))
+    return figures

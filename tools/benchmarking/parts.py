@@ -1,0 +1,140 @@
+"""What a preview is made of, for suites that look at it from inside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.edits.model import EMPTY_STACK, EditStack
+from icheat_usd.relight.lights import LiveLights
+from icheat_usd.samples import GatherSamples, ViewSamples
+from icheat_usd.scene import F32, LightKind, SceneSnapshot
+from icheat_usd.session.document import Session
+from icheat_usd.session.quality import PREVIEW, Quality
+from icheat_usd.session.shot_parts import ShotParts
+from icheat_usd.tracing import Tracer
+from icheat_usd.transport import Transport
+from tools.benchmarking.stage_names import short_name
+
+AREA_KINDS = (LightKind.SPHERE, LightKind.DISK, LightKind.RECT, LightKind.CYLINDER)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Size and quality of what is measured; None leaves the preview's own setting."""
+
+    width: int = 640
+    height: int = 480
+    n_gather: int | None = None
+    quality: str = "PREVIEW"  #: name of a quality of `icheat_usd.session`
+
+    def settings(self) -> Quality:
+        import icheat_usd.session.quality as qualities
+
+        quality: Quality = getattr(qualities, self.quality, PREVIEW)
+        return quality if self.n_gather is None else replace(quality, n_gather=self.n_gather)
+
+
+class Parts:
+    """One stage, ready to be relit; each part is made when it is first asked for.
+
+    Parameters
+    ----------
+    snapshot : SceneSnapshot, optional
+        In place of the stage's own, such as one under other lights.
+    """
+
+    def __init__(self, stage: str | Path, effort: Effort, snapshot: SceneSnapshot | None = None) -> None:
+        self.name = short_name(str(stage))
+        self.effort = effort
+        self.session = Session.open(stage, width=effort.width, height=effort.height, quality=effort.settings())
+        self.snapshot = self.session.snapshot if snapshot is None else snapshot
+        self._shot = ShotParts(effort.settings(), snapshot=self.snapshot)
+
+    def under(self, snapshot: SceneSnapshot) -> Parts:
+        """The same stage with other lights."""
+        other = Parts.__new__(Parts)
+        other.name, other.effort, other.session, other.snapshot = self.name, self.effort, self.session, snapshot
+        other._shot = ShotParts(self.effort.settings(), snapshot=snapshot)
+        return other
+
+    @property
+    def tracer(self) -> Tracer:
+        return self._shot.tracer
+
+    @property
+    def view(self) -> ViewSamples:
+        return self._shot.view
+
+    @property
+    def gather(self) -> GatherSamples:
+        return self._shot.gather
+
+    @property
+    def bounces(self) -> Any:
+        return self._shot.bounces
+
+    @cached_property
+    def transport(self) -> Transport | None:
+        """Exact rows at the records; None where they were not kept."""
+        source = getattr(self.packed, "source", None)
+        return source if isinstance(source, Transport) else self._shot.transport
+
+    @cached_property
+    def packed(self) -> Any:
+        """What frames multiply with."""
+        return getattr(self._shot, "packed", None) or self._shot.transport
+
+    @cached_property
+    def lights(self) -> LiveLights:
+        return LiveLights(self.snapshot, self.tracer, self.view, self.gather, self.bounces)
+
+    @cached_property
+    def live(self) -> Any:
+        from icheat_usd.relight.live import LiveRelighter
+
+        return LiveRelighter(self.snapshot, self.view, self.gather, self.packed, self.lights)
+
+    def refine_lights(self) -> None:
+        """Bring the lights to the quality that they have at rest."""
+        while self.lights.refine():
+            pass
+
+    def edit_change(self, stack: EditStack, gains: F32) -> F32:
+        """What a stack changes of the indirect light of every view sample, (n_view, 3)."""
+        before = self.lights.gains.copy()
+        self._set_gains(gains)
+        self.live.set_stack(stack)
+        lit = self.live.relit()
+        self.live.set_stack(EMPTY_STACK)
+        self._set_gains(before)
+        return lit.indirect_edited - lit.indirect
+
+    def _set_gains(self, gains: F32) -> None:
+        for light, gain in enumerate(np.asarray(gains, np.float32)):
+            self.lights.set_gain(light, gain)
+
+
+def with_movable_lights(parts: Parts) -> tuple[Parts, list[str]]:
+    """The stage with an area light and a dome, and what had to be added."""
+    from tools.benchmarking.test_lights import TestLight, add_lights
+
+    added: list[TestLight] = []
+    kinds = parts.snapshot.lights.kind
+    camera = parts.snapshot.camera.to_world
+    radius = parts.snapshot.radius
+    if not np.isin(kinds, [int(kind) for kind in AREA_KINDS]).any():
+        # At the camera, which stands in free space and looks along -Z as rectangles shine.
+        size = (0.1 * radius, 0.1 * radius)
+        added.append(TestLight("addedArea", LightKind.RECT, camera, (5.0, 5.0, 5.0), size))
+    if not (kinds == int(LightKind.DOME)).any():
+        flat = np.full((16, 32, 3), 0.3, np.float32)
+        flat[:6, :8] = 2.0
+        added.append(TestLight("addedDome", LightKind.DOME, np.eye(3, 4), (1.0, 1.0, 1.0), image=flat))
+    if not added:
+        return parts, []
+    return parts.under(add_lights(parts.snapshot, added)), [light.name for light in added]
