@@ -39,6 +39,28 @@ def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
     return EditField(edits, group, n_groups, _findings(edits))
 
 
+def rebind(bound: BoundEdit, edit: Edit, snapshot: SceneSnapshot) -> BoundEdit:
+    """Bind an edit that differs from a bound one in amount, parameters and weights of keys alone.
+
+    Raises
+    ------
+    EditError
+        A parameter is wrong.
+    """
+    payloads = _payloads(edit)
+    parameters = tuple(
+        _prepared(bound.operation, edit, payload, snapshot, receivers, casters)
+        for (payload, _), receivers, casters in zip(payloads, bound.receivers, bound.casters, strict=True)
+    )
+    return replace(bound, edit=edit, parameters=parameters, key_weights=tuple(weight for _, weight in payloads))
+
+
+def _payloads(edit: Edit) -> list[tuple[Payload | None, float]]:
+    if not edit.keys:
+        return [(None, 1.0)]
+    return [(key.payload, key.weight) for key in edit.keys if key.payload is not None]
+
+
 def _light_groups(stack: EditStack, snapshot: SceneSnapshot) -> tuple[I64, dict[str, Bool]]:
     """Lights that no edit tells apart form a group; which groups each edit with lights of its own acts on."""
     named = {edit.path: _named_lights(edit, snapshot) for edit in stack.active if edit.lights}
@@ -68,9 +90,7 @@ def _findings(edits: tuple[BoundEdit, ...]) -> tuple[Finding, ...]:
 
 def _bind_edit(edit: Edit, snapshot: SceneSnapshot, groups: Bool | None) -> BoundEdit:
     operation = operations.find(edit.operation)
-    payloads: list[tuple[Payload | None, float]] = [(None, 1.0)]
-    if edit.keys:
-        payloads = [(key.payload, key.weight) for key in edit.keys if key.payload is not None]
+    payloads = _payloads(edit)
     rows, baked = [], []
     for payload, _ in payloads:
         sampled = None if operation is not None or payload is None else payload.rows

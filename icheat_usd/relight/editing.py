@@ -33,8 +33,15 @@ class LitCasters(NamedTuple):
 def edit_view(transport: Transport, lit: LitCasters, field: EditField, receivers: Receivers, indirect: F32) -> F32:
     """Edited indirect radiance of all view samples, (n_view, 3); untouched ones keep the bits of `indirect`."""
     edited = indirect.copy()
-    offsets = offset_casters(field, lit.ends, lit.b, lit.area)
     light = np.take(indirect, receivers.samples, axis=0)
+    edit_samples(transport, lit, field, receivers, light)
+    edited[receivers.samples] = field.finish(light, receivers.ends)
+    return edited
+
+
+def edit_samples(transport: Transport, lit: LitCasters, field: EditField, receivers: Receivers, light: F32) -> None:
+    """Replace the `light` (n, 3) of the receivers that edits of pairs and aggregates reach; views do not act yet."""
+    offsets = offset_casters(field, lit.ends, lit.b, lit.area)
     for group in receivers.groups:
         shared = _SharedReceivers(transport, lit, field, receivers, group, offsets)
         light[group.where] = shared.light() if group.last is None else shared.light_with_last()
@@ -42,8 +49,13 @@ def edit_view(transport: Transport, lit: LitCasters, field: EditField, receivers
         samples = receivers.samples[where]
         blocks = _blocks(transport, lit, receivers, samples)
         light[where] = edited_light(field, receivers.ends.take(where), blocks, offsets, lit.albedo[samples])
-    edited[receivers.samples] = field.finish(light, receivers.ends)
-    return edited
+
+
+def unedited_samples(transport: Transport, samples: I64, radiance: F32) -> F32:
+    """Light of some view samples from (n_gather, 3) radiance: (n, 3)."""
+    light = np.zeros((len(samples), 3), np.float32)
+    _add_products(transport.lobes, transport.interpolation, samples, radiance, light)
+    return light
 
 
 # Groups ---------------------------------------------------------------------------------------------------------------

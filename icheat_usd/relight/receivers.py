@@ -10,7 +10,7 @@ are evaluated pair by pair. All ways are exact.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,9 +18,10 @@ from icheat_usd.edits.bound import BoundEdit, Ends
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.operations import Level
+from icheat_usd.errors import EditError
 from icheat_usd.samples import ViewSamples
 from icheat_usd.scene import F32, I64, Bool
-from icheat_usd.transport import Lobe
+from icheat_usd.transport import HeldBack, Lobe
 
 #: An edited copy of the radiance costs about as much as this many rows evaluated pair by pair.
 SMALLEST_GROUP = 64
@@ -49,7 +50,11 @@ def group_receivers(field: EditField, view: ViewSamples) -> Receivers:
     """Sort the view samples by their receiver masks."""
     everywhere = field.receivers(view.points)
     samples = np.flatnonzero((everywhere.masks > 0).any(axis=0))
-    ends = everywhere.take(samples)
+    return group_samples(field, samples, everywhere.take(samples))
+
+
+def group_samples(field: EditField, samples: I64, ends: Ends) -> Receivers:
+    """Sort some view samples, ascending, by their receiver masks."""
     if len(samples) == 0:
         return Receivers(samples, ends, (), samples)
     # What touches views is applied at the very end.
@@ -82,6 +87,26 @@ def group_receivers(field: EditField, view: ViewSamples) -> Receivers:
     for group in groups:
         single[group.where] = False
     return Receivers(samples, ends, tuple(groups), np.flatnonzero(single))
+
+
+def behind_occluders(field: EditField, receivers: Receivers, held_back: HeldBack | None) -> Receivers:
+    """The receivers with the rows of what edits let pass their occluders.
+
+    Raises
+    ------
+    EditError
+        The stack has such edits, and `held_back` is None.
+    """
+    if not field.throughs:
+        return receivers
+    if held_back is None:
+        raise EditError("the edit stack lets light pass occluders, which needs a HeldBack; give the relighter one")
+    lobes = []
+    for edit in field.throughs:
+        masks = receivers.ends.masks[field.rows_of(edit)]
+        reached = receivers.samples[(masks > 0).any(axis=0)]
+        lobes.append(held_back.rows(reached, field.edits[edit].occluders))
+    return replace(receivers, held_back=tuple(lobes))
 
 
 def _alike(masks: F32, which: I64) -> Iterator[I64]:

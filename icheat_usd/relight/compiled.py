@@ -1,0 +1,170 @@
+"""A bound stack as tables for kernels: what acts on each gather cell, in order, with which numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from icheat_usd.edits.bound import BoundEdit
+from icheat_usd.edits.field import EditField
+from icheat_usd.edits.model import Blend
+from icheat_usd.edits.operations import Level, PairCoefficients, PairEnd, Pairs
+from icheat_usd.edits.operations.base import number
+from icheat_usd.edits.operations.hsv import Hsv
+from icheat_usd.kernels import versions as kernels
+from icheat_usd.samples import GatherSamples
+from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
+
+_BLENDS = {Blend.COMPOSE: kernels.COMPOSE, Blend.OVER: kernels.OVER, Blend.ADD: kernels.ADD}
+_NOWHERE = PairEnd(*(np.zeros((1, 3), np.float32),) * 3)
+
+
+class Way(IntEnum):
+    """How the light of receivers under a row of the stack is found."""
+
+    VERSION = 0  #: receivers share edited copies of the casters' radiance
+    AGGREGATE = 1  #: they do, and each makes something of its own of the sum
+    VIEW = 2  #: at the end
+    ALONE = 3  #: pair by pair
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledStack:
+    """Rows are those of the field's masks, one for each edit and key; members are rows, then emission of aggregates."""
+
+    field: EditField
+    way: I64  #: (n_rows,) `Way`
+    edit_of: I64  #: (n_members,)
+    looks: Bool  #: (n_rows,) the coefficients depend on the light that weaker edits left
+    row_table: I64  #: (n_rows, 5) see `kernels.versions.compose`
+    row_amount: F64  #: (n_rows,) amount times key weight
+    groups: U8  #: (n_edits, G) groups of lights
+    cell_begin: I64  #: (n_gather + 1,) entries of each cell
+    entry_row: I32
+    entry_weight: F32
+    entry_slot: I32
+    slots: F64  #: (n_slots, 9) scale, emission and offset, or the numbers of an operation
+    slot_begin: I64  #: (n_rows + 1,) those of each row: one, or one for each cell of its support
+    support: Bool  #: (n_rows, n_gather) cells on surfaces that the casters may lie on, painted or not
+    together: Bool  #: (n_signatures, n_rows) rows that occur together at some cell
+
+    @property
+    def n_rows(self) -> int:
+        return len(self.way)
+
+    def meet(self, rows: Iterable[int]) -> Bool:
+        """Which of the signatures have all these rows (members stand for their row)."""
+        found = np.ones(len(self.together), np.bool_)
+        for row in rows:
+            found &= self.together[:, self.row_of(row)]
+        return found
+
+    def row_of(self, member: int) -> int:
+        """Row of the stack of a member."""
+        if member < self.n_rows:
+            return member
+        return int(np.flatnonzero(self.row_table[:, 4] == member)[0])
+
+    def rows_before(self, edit: int) -> int:
+        """Rows of the edits before one."""
+        return int(np.searchsorted(self.row_table[:, 0], edit))
+
+
+def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) -> CompiledStack:
+    """Write a bound stack as tables.
+
+    Parameters
+    ----------
+    caster_masks : (n_rows, n_gather) of `EditField.casters`
+    """
+    rows = [(edit, bound, key) for edit, bound in enumerate(field.edits) for key in range(bound.n_keys)]
+    way = np.array([_way(bound) for _, bound, _ in rows], np.int64)
+    aggregates = np.flatnonzero(way == Way.AGGREGATE)
+    table = np.full((len(rows), 5), -1, np.int64)
+    for row, (edit, bound, _) in enumerate(rows):
+        kind = kernels.AGGREGATE if way[row] == Way.AGGREGATE else kernels.CONSTANT
+        kind = kernels.HSV if isinstance(bound.operation, Hsv) else kind
+        table[row, :4] = edit, kind, _BLENDS[bound.edit.blend], bound.offset_is_paint
+    table[aggregates, 4] = len(rows) + np.arange(len(aggregates))
+    instance = gather.points.instance
+    on_instances = np.zeros((len(rows), max(int(instance.max(initial=0)) + 1, 1)), np.bool_)
+    for row, (_, bound, key) in enumerate(rows):
+        if way[row] in (Way.VERSION, Way.AGGREGATE):
+            on_instances[row] = bound.casters[key].on_instances[: on_instances.shape[1]] > 0
+    support = on_instances[:, np.maximum(instance, 0)] & (instance >= 0)
+    cells = [np.flatnonzero(there) for there in support]
+    slots, slot_begin, slot = _slots(rows, way, cells, gather)
+    cell = np.concatenate([np.empty(0, np.int64), *cells])
+    row_of = np.repeat(np.arange(len(rows)), [len(there) for there in cells])
+    order = np.argsort(cell, kind="stable")
+    cell, row_of = cell[order], row_of[order]
+    begin = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=gather.n))]).astype(np.int64)
+    edit_of = np.concatenate([table[:, 0], table[aggregates, 0]]).astype(np.int64)
+    return CompiledStack(
+        field,
+        way,
+        edit_of,
+        np.array([bound.operation is not None and bound.operation.uses_incident for _, bound, _ in rows], np.bool_),
+        table,
+        np.array([np.float64(bound.edit.amount * bound.key_weights[key]) for _, bound, key in rows], np.float64),
+        np.array([bound.groups for bound in field.edits], np.uint8).reshape(len(field.edits), field.n_groups),
+        begin,
+        row_of.astype(np.int32),
+        np.ascontiguousarray(caster_masks[row_of, cell], np.float32),
+        slot[order].astype(np.int32),
+        slots,
+        slot_begin,
+        support,
+        np.unique(on_instances[:, np.unique(instance[instance >= 0])].T, axis=0),
+    )
+
+
+def _way(bound: BoundEdit) -> Way:
+    operation = bound.operation
+    if bound.level is Level.VIEW:
+        return Way.VIEW
+    if bound.level is Level.AGGREGATE:
+        return Way.AGGREGATE if bound.edit.blend is Blend.COMPOSE else Way.ALONE
+    if operation is None:
+        return Way.ALONE if any(rows is not None for rows in bound.rows) else Way.VERSION
+    other_incident = operation.uses_incident and type(operation) is not Hsv
+    return Way.ALONE if operation.uses_receiver or operation.has_through or other_incident else Way.VERSION
+
+
+def _slots(
+    rows: list[tuple[int, BoundEdit, int]], way: I64, cells: list[I64], gather: GatherSamples
+) -> tuple[F64, I64, I64]:
+    """Numbers of all rows, where those of each begin, and which each row has at each of its cells, row by row."""
+    parts: list[F64] = []
+    slot, begin, n = [np.empty(0, np.int64)], [0], 0
+    for row, (_, bound, key) in enumerate(rows):
+        part = numbers_of(bound, key, gather, cells[row]) if way[row] == Way.VERSION else np.zeros((1, 9))
+        slot.append(n + (np.arange(len(cells[row])) if len(part) > 1 else np.zeros(len(cells[row]), np.int64)))
+        parts.append(part)
+        n += len(part)
+        begin.append(n)
+    return np.concatenate([np.zeros((0, 9)), *parts]), np.array(begin, np.int64), np.concatenate(slot)
+
+
+def numbers_of(bound: BoundEdit, key: int, gather: GatherSamples, cells: I64) -> F64:
+    """What a row of `Way.VERSION` does: (1, 9), or (len(cells), 9) where it differs between casters."""
+    operation = bound.operation
+    if isinstance(operation, Hsv):
+        names = ("hue", "saturation", "value")
+        return np.array([[number(bound.parameters[key], name) for name in names] + [0.0] * 6])
+    place = _NOWHERE
+    if operation is not None and operation.uses_caster:
+        points = gather.points
+        place = PairEnd(points.position[cells], points.shading_normal[cells], points.albedo[cells])
+    pairs = Pairs(np.zeros((len(place.position), 3), np.float32), _NOWHERE, place)
+    found: PairCoefficients = bound.evaluate(key, pairs, None, None)
+    values = (found.scale, found.emission, found.offset)
+    n = max((len(value) for value in values if value is not None), default=1)
+    out = np.zeros((max(n, 1), 9))
+    for column, value in enumerate(values):
+        if value is not None:
+            out[:, 3 * column : 3 * column + 3] = value
+    return out

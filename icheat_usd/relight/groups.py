@@ -1,0 +1,148 @@
+"""View samples grouped by which rows of a stack touch them, wholly or softly, and the terms that make their light.
+
+Light is affine in every soft mask and in what every aggregate came to, so that
+
+    light = base + sum over terms of (product of factors) x (transport x version)
+
+with few terms: a difference that several edits make together is 0 unless some
+caster is touched by all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels.versions import COMPOSE
+from icheat_usd.relight.compiled import CompiledStack, Way
+from icheat_usd.relight.versions import VersionKey
+from icheat_usd.scene import F32, I32, I64
+
+#: More terms than this, and the samples of a group are evaluated pair by pair.
+MOST_TERMS = 16
+
+
+class Term(NamedTuple):
+    """One summand of the light of a group's samples."""
+
+    version: VersionKey
+    factors: tuple[int, ...]  #: members of the stack whose soft mask, or what they came to, multiply
+
+
+class GroupTerms(NamedTuple):
+    """How the light of the samples of one group is put together; `alone`: it is not, but pair by pair."""
+
+    light: tuple[Term, ...] = ()
+    seen: tuple[tuple[int, tuple[Term, ...]], ...] = ()  #: by row of each aggregate, in order: the light that it sees
+    alone: bool = False
+
+
+class TermTable(NamedTuple):
+    """Terms of all groups as arrays, see `kernels.versions.add_terms`."""
+
+    term_begin: I64
+    term_version: I32
+    factor_begin: I64
+    factor: I32
+
+
+def group_terms(compiled: CompiledStack, whole: Sequence[int], soft: Sequence[int]) -> GroupTerms:
+    """Terms of samples that some rows touch wholly and some softly."""
+    way = compiled.way
+    touching = [row for row in (*whole, *soft) if way[row] != Way.VIEW]
+    aggregates = sorted(row for row in touching if way[row] == Way.AGGREGATE)
+    if any(way[row] == Way.ALONE for row in touching):
+        return GroupTerms(alone=True)
+    hard = tuple(sorted(row for row in whole if way[row] == Way.VERSION and _meets(compiled, (row,))))
+    varying = [row for row in soft if way[row] == Way.VERSION] + aggregates
+    if _looks_at_soft(compiled, touching, varying):
+        return GroupTerms(alone=True)
+    members = sorted(varying + [int(compiled.row_table[row, 4]) for row in aggregates], key=_order(compiled))
+    light = _terms(compiled, hard, members, -1)
+    seen = []
+    for row in aggregates:
+        edit = compiled.edit_of[row]
+        below = [member for member in members if compiled.edit_of[member] < edit]
+        terms = _terms(compiled, tuple(r for r in hard if compiled.edit_of[r] < edit), below, row)
+        seen.append((row, terms))
+    if max([len(light), *(len(terms) for _, terms in seen)]) > MOST_TERMS:
+        return GroupTerms(alone=True)
+    return GroupTerms(light, tuple(seen))
+
+
+def _order(compiled: CompiledStack):  # type: ignore[no-untyped-def]
+    return lambda member: (int(compiled.edit_of[member]), member)
+
+
+def _meets(compiled: CompiledStack, members: Sequence[int]) -> bool:
+    return bool(compiled.meet(members).any())
+
+
+def _looks_at_soft(compiled: CompiledStack, touching: Sequence[int], varying: Sequence[int]) -> bool:
+    """Whether an edit looks at light that a weaker one leaves in an amount of each sample's own."""
+    for row in touching:
+        if compiled.looks[row] and compiled.way[row] == Way.VERSION and compiled.row_table[row, 2] == COMPOSE:
+            for below in varying:
+                if compiled.edit_of[below] < compiled.edit_of[row] and _meets(compiled, (row, below)):
+                    return True
+    return False
+
+
+def _terms(compiled: CompiledStack, hard: tuple[int, ...], members: Sequence[int], restrict: int) -> tuple[Term, ...]:
+    inside = () if restrict < 0 else (restrict,)
+    found: list[Term] = []
+
+    def extend(differ: tuple[int, ...], begin: int) -> None:
+        if len(found) > MOST_TERMS:
+            return
+        together = (*differ, *inside)
+        acting = tuple(row for row in hard if not together or _meets(compiled, (*together, row)))
+        if together or acting:
+            found.append(Term(VersionKey(acting, differ, restrict), differ))
+        for k in range(begin, len(members)):
+            # Keys of one edit are summed, so that together they make no difference of their own.
+            same = any(compiled.edit_of[members[k]] == compiled.edit_of[other] for other in differ)
+            if not same and _meets(compiled, (*together, members[k])):
+                extend((*differ, members[k]), k + 1)
+
+    if not inside or _meets(compiled, inside):
+        extend((), 0)
+    return tuple(found)
+
+
+class SampleGroups:
+    """Which group each view sample belongs to; groups are numbered as they appear."""
+
+    def __init__(self, compiled: CompiledStack, n_view: int) -> None:
+        self._compiled = compiled
+        self._number: dict[bytes, int] = {}
+        self.of_sample: I32 = np.full(n_view, -1, np.int32)  #: -1: no edit touches it
+        self.terms: list[GroupTerms] = []
+
+    def assign(self, samples: I64, masks: F32) -> int:
+        """Find the groups of some samples by their receiver masks; returns how many groups are new."""
+        n_before = len(self.terms)
+        words = max(1, -(-len(masks) // 64))
+        keys = np.empty((len(samples), 2 * words), np.uint64)
+        kernels.signatures(masks, samples, keys)
+        table = np.full(1 << max(4, int(np.ceil(np.log2(max(2 * len(samples), 1))))), -1, np.int64)
+        first, local = np.empty(len(samples), np.int64), np.empty(len(samples), np.int64)
+        n = kernels.group_rows(keys, table, first, local)
+        number = np.array([self._group(keys[k], words) for k in first[:n]], np.int32)
+        self.of_sample[samples] = number[local] if n else -1
+        return len(self.terms) - n_before
+
+    def _group(self, key: np.ndarray, words: int) -> int:
+        if not key.any():
+            return -1
+        name = key.tobytes()
+        if name not in self._number:
+            n_rows = self._compiled.n_rows
+            bits = np.unpackbits(key.view(np.uint8), bitorder="little")
+            whole, soft = (np.flatnonzero(bits[side : side + n_rows]).tolist() for side in (0, 64 * words))
+            self._number[name] = len(self.terms)
+            self.terms.append(group_terms(self._compiled, whole, soft))
+        return self._number[name]

@@ -1,0 +1,309 @@
+"""A view that is edited and relit while someone watches: every change costs what it touches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Protocol
+
+import numpy as np
+
+from icheat_usd.edits.bound import Ends, sent_anew
+from icheat_usd.edits.model import EditStack
+from icheat_usd.errors import SampleSetMismatch
+from icheat_usd.kernels import versions as kernels
+from icheat_usd.relight.alone import AloneSamples
+from icheat_usd.relight.compiled import Way
+from icheat_usd.relight.groups import SampleGroups, TermTable
+from icheat_usd.relight.live_stack import LiveStack
+from icheat_usd.relight.products import Products
+from icheat_usd.relight.relighter import RelitView
+from icheat_usd.relight.term_tables import TermTables
+from icheat_usd.relight.versions import Versions
+from icheat_usd.samples import GatherSamples, ViewSamples
+from icheat_usd.samples.develop import develop
+from icheat_usd.scene import F32, I64, Bool, SceneSnapshot
+from icheat_usd.transport import HeldBack, Transport, sum_groups
+from icheat_usd.transport.packed import PackedTransport
+
+
+class Lights(Protocol):
+    """What is asked of lights; see `relight.lights.LiveLights`."""
+
+    radiance: F32  #: (n_lights, n_gather, 3) at gain 1
+    gains: F32  #: (n_lights, 3)
+
+    def total(self) -> F32: ...
+    def direct(self) -> F32: ...
+    def refine(self) -> bool: ...
+
+
+class LiveRelighter:
+    """Edits and lights of one view at interactive rates, exact up to what packing loses of the transport.
+
+    Light under edits is the unedited light plus differences: products of the
+    transport with edited copies of the casters' radiance that many receivers
+    share (`relight.versions`), weighted by the receivers' soft masks. What
+    cannot be shared is evaluated pair by pair, from the exact rows. Whatever
+    the order of commands, the same state has the same bits.
+
+    Parameters
+    ----------
+    transport : PackedTransport or Transport
+        Exact rows need no packing, and are slower.
+    held_back : HeldBack, optional
+        Needed by edits that let light pass occluders.
+    """
+
+    def __init__(
+        self,
+        snapshot: SceneSnapshot,
+        view: ViewSamples,
+        gather: GatherSamples,
+        transport: PackedTransport | Transport,
+        lights: Lights,
+        *,
+        held_back: HeldBack | None = None,
+    ) -> None:
+        self.view, self.gather, self.lights, self.held_back = view, gather, lights, held_back
+        self._snapshot = snapshot
+        self._albedo = np.ascontiguousarray(view.points.albedo)
+        self._throughput = np.ascontiguousarray(view.throughput)
+        n_pixels = view.width * view.height
+        self._sample_begin = np.searchsorted(view.pixel, np.arange(n_pixels + 1)).astype(np.int64)
+        self._still = (view.background + develop(view, view.points.emission)).astype(np.float32)
+        self._film: F32 = np.zeros((n_pixels, 3), np.float32)
+        self._all_pixels = np.arange(n_pixels, dtype=np.int64)
+        self._direct: F32 = np.zeros((view.n, 3), np.float32)
+        self._base: F32 = np.zeros((view.n, 3), np.float32)
+        self._edited: F32 = np.zeros((view.n, 3), np.float32)
+        self._lights_seen: Any = None
+        self._light_stale = True
+        self._stack = LiveStack(snapshot, view, gather)
+        self.set_transport(transport)
+
+    # Commands ---------------------------------------------------------------------------------------------------------
+
+    def set_transport(self, transport: PackedTransport | Transport) -> None:
+        """Go on with other rows of the same view and gather samples, such as finer ones."""
+        for lobe in transport.lobes:
+            if len(lobe.tint) != self.view.n:
+                raise SampleSetMismatch(
+                    f"the transport has {len(lobe.tint)} view samples, and the view {self.view.n}; build it for this view"
+                )
+        self.transport = transport
+        self._products = Products(transport, self.gather.tree)
+        self._regroup()
+
+    def set_stack(self, stack: EditStack) -> None:
+        """Show another stack; what only differs in amounts and parameters keeps its structure.
+
+        Raises
+        ------
+        EditError
+            An edit cannot be placed on the scene; what was shown before stays.
+        """
+        self._changed(self._stack.set_stack(stack, self._light_paths()))
+
+    def set_amount(self, edit_path: str, amount: float) -> None:
+        """Change how much of one edit is laid over the others; 0 leaves it out.
+
+        Raises
+        ------
+        EditError
+            There is no such edit, or the amount is not finite.
+        """
+        self._changed(self._stack.set_amount(edit_path, amount))
+
+    @property
+    def stack(self) -> EditStack:
+        """The stack that is shown."""
+        return self._stack.stack
+
+    # Results ----------------------------------------------------------------------------------------------------------
+
+    def frame(self, out: F32 | None = None) -> F32:
+        """The image as it is now, (height, width, 3) float32, scene-linear; everything that changed is recomputed.
+
+        Parameters
+        ----------
+        out : (height, width, 3) float32, optional
+            Where to put it.
+        """
+        self._update()
+        image = self._film.reshape(self.view.height, self.view.width, 3)
+        if out is None:
+            return image.copy()
+        if out.shape != image.shape or out.dtype != np.float32:
+            raise SampleSetMismatch(f"an image of shape {out.shape} {out.dtype} cannot hold {image.shape} float32")
+        np.copyto(out, image)
+        return out
+
+    def relit(self) -> RelitView:
+        """Light of every view sample, in layers."""
+        self._update()
+        return RelitView(self._direct.copy(), self._base.copy(), self._edited.copy())
+
+    def refine(self) -> bool:
+        """At rest: bring the lights closer to what they are; False when nothing is left."""
+        return bool(self.lights.refine())
+
+    # Structure --------------------------------------------------------------------------------------------------------
+
+    def _light_paths(self) -> tuple[str, ...]:
+        return tuple(getattr(self.lights, "paths", self._snapshot.light_paths))
+
+    def _changed(self, rows: list[int] | None) -> None:
+        if rows is None:
+            self._regroup()
+            return
+        self._versions.stack_changed(self._stack.compiled, rows)
+        self._changed_rows.update(rows)
+        if self._stack.active_rows != self._active_rows:
+            self._find_touched()
+
+    def _regroup(self) -> None:
+        """Find anew which samples share what."""
+        stack = self._stack
+        self._groups = SampleGroups(stack.compiled, self.view.n)
+        self._versions = Versions(stack.compiled, self._products, self.gather.area)
+        self._terms = TermTables(stack.compiled, self._groups, self._versions)
+        self._changed_rows: set[int] = set()
+        self._samples_of: dict[frozenset[int], tuple[I64, I64]] = {}
+        self._light_stale = True
+        self._place(np.flatnonzero((stack.receiver_masks != 0).any(axis=0)))
+
+    def _place(self, samples: I64) -> None:
+        """Find the groups of some samples, and make the versions and products that these need."""
+        groups, products = self._groups, self._products
+        groups.assign(samples, self._stack.receiver_masks)
+        self._terms.arrange()
+        spread = products.interpolation
+        needed = np.zeros((self._versions.n, products.n_tiles), np.uint8)
+        touched = samples[groups.of_sample[samples] >= 0]
+        for terms in self._terms.steps:
+            kernels.mark_pairs(
+                touched,
+                groups.of_sample,
+                terms.term_begin,
+                terms.term_version,
+                products.is_sparse,
+                spread.indptr,
+                spread.indices,
+                needed,
+            )
+        self._versions.need(needed)
+        self._alone: Bool = np.append(self._terms.alone, False)[groups.of_sample]
+        samples = np.flatnonzero(self._alone)
+        self._alone_samples: AloneSamples | None = None
+        self._alone_difference: F32 = np.zeros((self.view.n if len(samples) else 0, 3), np.float32)
+        if len(samples):
+            stack = self._stack
+            self._alone_samples = AloneSamples(stack.field, samples, self.view, self.transport, self.held_back)
+        self._find_touched()
+
+    def _find_touched(self) -> None:
+        """Which samples the edits that are not muted touch; the others keep their unedited light, bit for bit."""
+        self._active_rows = self._stack.active_rows
+        self._touched = self._touched_by(self._active_rows)
+
+    def _touched_by(self, rows: Iterable[int]) -> Bool:
+        found = np.zeros(self.view.n, np.bool_)
+        for row in rows:
+            found |= self._stack.receiver_masks[row] != 0
+        return found
+
+    def _samples_of_rows(self, rows: frozenset[int]) -> tuple[I64, I64]:
+        """Samples that some rows touch, and their pixels."""
+        if rows not in self._samples_of:
+            samples = np.flatnonzero(self._touched_by(rows))
+            pixels = self.view.pixel[samples].astype(np.int64)
+            self._samples_of[rows] = samples, pixels[np.diff(pixels, prepend=-1) != 0]
+        return self._samples_of[rows]
+
+    # Evaluation -------------------------------------------------------------------------------------------------------
+
+    def _update(self) -> None:
+        self._look_at_lights()
+        if not self._light_stale and not self._changed_rows:
+            return
+        if self._light_stale:
+            b = np.ascontiguousarray(self.lights.total(), np.float32)
+            self._direct = np.ascontiguousarray(self.lights.direct(), np.float32)
+            self._base = self.transport.to_view(b)
+            self._edited = self._base.copy()
+            self._by_group = self._light_by_group(b)
+            self._versions.light_changed(self._by_group)
+            samples, pixels = np.flatnonzero(self._touched), self._all_pixels
+        else:
+            samples, pixels = self._samples_of_rows(frozenset(self._changed_rows))
+        self._versions.update()
+        self._edit(samples)
+        self._light_stale = False
+        self._changed_rows = set()
+        kernels.develop_pixels(
+            pixels, self._sample_begin, self._still, self._throughput, self._direct, self._edited, self._film
+        )
+
+    def _look_at_lights(self) -> None:
+        revision = getattr(self.lights, "revision", None)
+        if self._light_paths() != self._stack.light_paths:
+            self._changed(self._stack.set_stack(self._stack.stack, self._light_paths()))
+        # Lights that do not tell are taken to have changed.
+        self._light_stale |= revision is None or revision != self._lights_seen
+        self._lights_seen = revision
+
+    def _light_paths(self) -> tuple[str, ...]:
+        return tuple(getattr(self.lights, "paths", self._snapshot.light_paths))
+
+    def _light_by_group(self, b: F32) -> F32:
+        field = self._stack.field
+        if field.n_groups == 1:
+            return b[None]
+        return sum_groups(self.lights.radiance * self.lights.gains[:, None, :], field.light_group, field.n_groups)
+
+    def _edit(self, samples: I64) -> None:
+        """Find the edited light of some samples."""
+        idle = samples[~self._touched[samples]]
+        self._edited[idle] = self._base[idle]
+        samples = samples[self._touched[samples]]
+        if not len(samples):
+            return
+        light = np.take(self._base, samples, axis=0)
+        self._add(self._terms.light, samples, self._aggregate_factors(samples), light)
+        if self._alone_samples is not None:
+            if self._alone[samples].any():
+                difference = self._alone_samples.difference(self._stack.field, self.gather, self._by_group)
+                self._alone_difference[self._alone] = difference
+            light += self._alone_difference[samples]
+        self._edited[samples] = self._stack.field.finish(light, self._view_ends(samples))
+
+    def _add(self, terms: TermTable, samples: I64, own: F32, out: F32) -> None:
+        self._terms.add(terms, samples, self._stack.receiver_masks, own, self._products, self._albedo, out)
+
+    def _aggregate_factors(self, samples: I64) -> F32:
+        """What each aggregate makes of the light of its casters: (n, 2 n_aggregates, 3) scale - 1 and emission."""
+        stack, terms = self._stack, self._terms
+        own = np.zeros((len(samples), 2 * len(terms.aggregates), 3), np.float32)
+        for k, row in enumerate(terms.aggregates):
+            aggregate = next(found for found in stack.field.aggregates if found.row == row)
+            weight = np.float32(stack.compiled.row_amount[row]) * stack.receiver_masks[row, samples]
+            some = np.flatnonzero((weight != 0) & ~self._alone[samples])
+            if not len(some):
+                continue
+            here, mine = samples[some], own[some]
+            seen, reach = np.zeros((2, len(some), 3), np.float32)
+            self._add(terms.seen[k], here, mine, seen)
+            self._add(terms.reach[k], here, mine, reach)
+            found = sent_anew(*stack.field.resolve(aggregate, seen), reach)
+            assert found.emission is not None
+            own[some, 2 * k] = weight[some, None] * (found.scale - np.float32(1))
+            own[some, 2 * k + 1] = weight[some, None] * found.emission
+        return own
+
+    def _view_ends(self, samples: I64) -> Ends:
+        """Receiver masks of what acts on views, which is all that `EditField.finish` looks at."""
+        stack = self._stack
+        masks = np.zeros((len(stack.receiver_masks), len(samples)), np.float32)
+        for row in np.flatnonzero(stack.compiled.way == Way.VIEW):
+            masks[row] = stack.receiver_masks[row, samples]
+        return Ends(masks, None, ())

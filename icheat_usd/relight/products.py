@@ -1,0 +1,155 @@
+"""Products of transport rows with differences of the casters' radiance, tile by tile, exact or packed."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from icheat_usd.kernels import versions as kernels
+from icheat_usd.samples import ClusterTree
+from icheat_usd.scene import F32, F64, I32, I64
+from icheat_usd.transport import SparseRows, Transport
+from icheat_usd.transport.packed import LANES, PackedTransport
+
+
+class VersionTables(Protocol):
+    """The columns of `relight.versions` that products look at."""
+
+    cell_begin: I64
+    cells: I32
+    node_begin: I64
+    nodes: I32
+    child: I32
+
+
+class Products:
+    """One transport, and what each version of the light is in the basis of its rows."""
+
+    def __init__(self, transport: Transport | PackedTransport, tree: ClusterTree) -> None:
+        # A lobe that no view sample has holds no rows and costs nothing.
+        lobes: list[Any] = [lobe for lobe in transport.lobes if _n_entries(lobe.rows)]
+        self._rows = [lobe.rows for lobe in lobes]
+        self._haar = isinstance(transport, PackedTransport)
+        self._n_leaves = tree.n_leaves
+        self._tree = tree
+        n_view = len(transport.lobes[0].tint)
+        self.tints: F32 = np.ascontiguousarray(
+            np.stack([lobe.tint for lobe in lobes]) if lobes else np.zeros((0, n_view, 3)), np.float32
+        )
+        spread = transport.interpolation
+        self.interpolation: SparseRows = SparseRows.empty(0, 0) if spread is None else spread
+        self.is_sparse = int(spread is not None)
+        self.n_tiles = -(-(n_view if spread is None else spread.n_columns) // LANES)
+        self._versions: F32 = np.zeros((0, self._n_leaves, 4), np.float32)
+        if self._haar:
+            self._parent_of_leaf, self._parent = _parents(tree)
+            self._share, self._root = _shares(tree)
+
+    def room(self, n_pairs: int) -> F32:
+        """Place for products, (n_lobes, n_pairs, 64, 4)."""
+        return np.zeros((len(self._rows), n_pairs, LANES, 4), np.float32)
+
+    def clear(self) -> None:
+        """Forget all versions."""
+        self._versions[:] = 0
+
+    def reserve(self, n_versions: int) -> None:
+        """Have place for so many versions."""
+        if n_versions > len(self._versions):
+            grown = np.zeros((max(n_versions, len(self._versions) * 3 // 2), self._n_leaves, 4), np.float32)
+            grown[: len(self._versions)] = self._versions
+            self._versions = grown
+
+    def nodes(self, cells: I32) -> tuple[I32, I32]:
+        """Nodes of the tree above some cells and their children; nothing where no wavelets are needed."""
+        if not self._haar or not len(cells):
+            return np.empty(0, np.int32), np.empty((0, 2), np.int32)
+        tree, count = self._tree, np.zeros(1, np.int64)
+        begin = np.array([0, len(cells)], np.int64)
+        nodes, child = np.empty(0, np.int32), np.empty((0, 2), np.int32)
+        for fill in (0, 1):
+            kernels.nodes_of_cells(
+                cells,
+                begin,
+                self._parent_of_leaf,
+                self._parent,
+                tree.left,
+                tree.right,
+                count,
+                nodes,
+                child,
+                np.zeros(1, np.int64),
+                fill,
+            )
+            if fill == 0:
+                nodes, child = np.empty(count[0], np.int32), np.empty((count[0], 2), np.int32)
+        return nodes, child
+
+    def prepare(self, versions: I64, tables: VersionTables, deltas: F32) -> None:
+        """Bring the differences of some versions into the basis of the rows."""
+        if self._haar:
+            kernels.haar_of_cells(
+                versions,
+                tables.cell_begin,
+                deltas,
+                tables.node_begin,
+                tables.nodes,
+                tables.child,
+                self._share,
+                self._root,
+                self._versions,
+            )
+        else:
+            kernels.spread_cells(versions, tables.cell_begin, tables.cells, deltas, self._versions)
+
+    def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32) -> None:
+        """Products of some pairs of tile and version into ``out[:, pairs]``."""
+        if not len(pairs):
+            return
+        for lobe, rows in enumerate(self._rows):
+            if self._haar:
+                kernels.multiply_pairs(
+                    rows.tile_begin,
+                    rows.index,
+                    rows.scale,
+                    rows.value,
+                    self._versions,
+                    pairs,
+                    pair_tile,
+                    pair_version,
+                    out[lobe],
+                )
+            else:
+                kernels.multiply_sparse_pairs(
+                    rows.indptr, rows.indices, rows.weights, self._versions, pairs, pair_tile, pair_version, out[lobe]
+                )
+
+
+def _n_entries(rows: Any) -> int:
+    return rows.n_entries if isinstance(rows, SparseRows) else len(rows.index)
+
+
+def _parents(tree: ClusterTree) -> tuple[I32, I32]:
+    """Node above each leaf and above each node, -1 above the root."""
+    of_leaf = np.full(tree.n_leaves, -1, np.int32)
+    of_node = np.full(len(tree.left), -1, np.int32)
+    number = np.arange(len(tree.left), dtype=np.int32)
+    for side in (tree.left, tree.right):
+        leaf = side < 0
+        of_leaf[-1 - side[leaf]] = number[leaf]
+        of_node[side[~leaf]] = number[~leaf]
+    return of_leaf, of_node
+
+
+def _shares(tree: ClusterTree) -> tuple[F64, float]:
+    """Weights of the children's means in each node's, and the factor on their difference; see `haar_forward`."""
+    left, right = (
+        np.where(side < 0, tree.weight[np.maximum(-1 - side, 0)], tree.node_weight[np.maximum(side, 0)])
+        if len(tree.left)
+        else np.zeros(0)
+        for side in (tree.left, tree.right)
+    )
+    total = left + right
+    root = np.sqrt(tree.node_weight[0] if len(tree.left) else tree.weight[0])
+    return np.stack([left / total, right / total, np.sqrt(left * right / total)], axis=1), float(root)
