@@ -1,4 +1,4 @@
-"""Sixteen floats as one value in compiled loops, for the few kernels where that pays.
+"""Short vectors as values in compiled loops, for the few kernels where that pays.
 
 Written in LLVM's vector types, so they run anywhere: one register with
 AVX-512, several where registers are shorter. A loop over such values keeps
@@ -8,35 +8,69 @@ Addresses are integers, from `address_of` plus bytes; nothing is bounds-checked.
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.errors import TypingError
 from numba.extending import intrinsic, models, register_model
 
 from icheat_usd.kernels._jit import kernel
 
-WIDTH = 16
-
-_FLOATS = ir.VectorType(ir.FloatType(), WIDTH)
-
-
-class Floats(types.Type):
-    """The type of a vector of `WIDTH` float32."""
-
-    def __init__(self) -> None:
-        super().__init__(name="Floats")
+_F32, _I8, _I16, _I32 = ir.FloatType(), ir.IntType(8), ir.IntType(16), ir.IntType(32)
+_F16X = ir.VectorType(_F32, 16)
+_F4X = ir.VectorType(_F32, 4)
+_I16X = ir.VectorType(_I32, 16)
+_W32X = ir.VectorType(_I16, 32)
 
 
-floats = Floats()
+class Vector(types.Type):
+    """The type of a vector of one LLVM type."""
+
+    def __init__(self, name: str, llvm: ir.VectorType) -> None:
+        super().__init__(name=name)
+        self.llvm = llvm
 
 
-@register_model(Floats)
-class _FloatsModel(models.PrimitiveModel):
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _FLOATS)
+        super().__init__(dmm, fe_type, fe_type.llvm)
+
+
+floats = Vector("floats", _F16X)  #: 16 float32
+color = Vector("color", _F4X)  #: 4 float32
+integers = Vector("integers", _I16X)  #: 16 int32
+words = Vector("words", _W32X)  #: 32 int16
+
+Emit = Callable[[Any, Any], Any]
+
+
+def _operation(result: types.Type, *arguments: types.Type) -> Callable[[Emit], Any]:
+    """Make ``emit(builder, values)`` callable from compiled code."""
+
+    def decorate(emit: Emit) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            value = emit(builder, values)
+            return context.get_dummy_value() if value is None else value
+
+        def typed(typingctx: Any, *given: types.Type) -> Any:
+            for has, wanted in zip(given, arguments, strict=True):
+                if isinstance(wanted, types.Integer) and not isinstance(has, types.Integer):
+                    raise TypingError(f"{emit.__name__}: an address has become {has}")
+            return result(*arguments), codegen
+
+        names = ["typingctx", *(f"value_{i}" for i in range(len(arguments)))]
+        parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+        vars(typed)["__signature__"] = inspect.Signature(parameters)
+        typed.__name__, typed.__doc__ = emit.__name__, emit.__doc__
+        return cast(Any, intrinsic)(typed)
+
+    return decorate
 
 
 @kernel
@@ -49,116 +83,211 @@ def _at(builder: Any, address: Any, kind: Any) -> Any:
     return builder.inttoptr(address, kind.as_pointer())
 
 
-def _spread(builder: Any, scalar: Any) -> Any:
-    one = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
-    lanes = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
-    return builder.shuffle_vector(one, ir.Constant(_FLOATS, ir.Undefined), lanes)
+def _load(builder: Any, address: Any, kind: Any) -> Any:
+    return builder.load(_at(builder, address, kind), align=1 if kind.element == _I8 else 4)
 
 
-@cast(Any, intrinsic)  # as a caller sees it: without the typing context
-def zeros(typingctx: Any) -> Any:
+def _spread(builder: Any, scalar: Any, kind: Any) -> Any:
+    undefined = ir.Constant(kind, ir.Undefined)
+    one = builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
+    return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(_I32, kind.count), [0] * kind.count))
+
+
+def _picked(builder: Any, a: Any, b: Any, lanes: list[int]) -> Any:
+    """Lanes of two vectors, those of `b` counted on from those of `a`."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(lanes)), lanes))
+
+
+def _call(builder: Any, name: str, kind: Any, *values: Any) -> Any:
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * len(values)), name)
+    return builder.call(function, values)
+
+
+# 16 floats
+
+
+@_operation(floats)
+def zeros(builder: Any, values: Any) -> Any:
     """All 0."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return ir.Constant(_FLOATS, [0.0] * WIDTH)
-
-    return floats(), codegen
+    return ir.Constant(_F16X, [0.0] * 16)
 
 
-@cast(Any, intrinsic)
-def load_int8(typingctx: Any, address: Any) -> Any:
-    """16 int8 from an address, as floats."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.VectorType(ir.IntType(8), WIDTH)
-        value = builder.load(_at(builder, args[0], kind), align=1)
-        return builder.sitofp(builder.sext(value, ir.VectorType(ir.IntType(32), WIDTH)), _FLOATS)
-
-    return floats(types.int64), codegen
-
-
-@cast(Any, intrinsic)
-def load(typingctx: Any, address: Any) -> Any:
+@_operation(floats, types.int64)
+def load(builder: Any, values: Any) -> Any:
     """16 float32 from an address."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(_at(builder, args[0], _FLOATS), align=4)
-
-    return floats(types.int64), codegen
+    return _load(builder, values[0], _F16X)
 
 
-@cast(Any, intrinsic)
-def load_spread(typingctx: Any, address: Any) -> Any:
+@_operation(floats, types.int64)
+def load_int8(builder: Any, values: Any) -> Any:
+    """16 int8 from an address."""
+    small = _load(builder, values[0], ir.VectorType(_I8, 16))
+    return builder.sitofp(builder.sext(small, _I16X), _F16X)
+
+
+@_operation(floats, types.int64)
+def load_spread(builder: Any, values: Any) -> Any:
     """The float32 at an address in all 16 places."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _spread(builder, builder.load(_at(builder, args[0], ir.FloatType()), align=4))
-
-    return floats(types.int64), codegen
+    return _spread(builder, builder.load(_at(builder, values[0], _F32), align=4), _F16X)
 
 
-@cast(Any, intrinsic)
-def scale_four(typingctx: Any, address: Any, factor: Any, target: Any) -> Any:
-    """Four float32 from `address` times `factor` to `target`."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.VectorType(ir.FloatType(), 4)
-        lanes = ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4)
-        one = builder.insert_element(ir.Constant(kind, ir.Undefined), args[1], ir.Constant(ir.IntType(32), 0))
-        value = builder.load(_at(builder, args[0], kind), align=4)
-        product = builder.fmul(value, builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), lanes))
-        builder.store(product, _at(builder, args[2], kind), align=4)
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.float32, types.int64), codegen
-
-
-@cast(Any, intrinsic)
-def spread(typingctx: Any, value: Any) -> Any:
+@_operation(floats, types.float32)
+def spread(builder: Any, values: Any) -> Any:
     """One float32 in all 16 places."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _spread(builder, args[0])
-
-    return floats(types.float32), codegen
+    return _spread(builder, values[0], _F16X)
 
 
-@cast(Any, intrinsic)
-def multiply_add(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+@_operation(floats, floats, floats, floats)
+def multiply_add(builder: Any, values: Any) -> Any:
     """``a * b + c``, rounded once where the machine can."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_FLOATS, [_FLOATS] * 3)
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.fmuladd.v16f32")
-        return builder.call(function, args)
-
-    return floats(floats, floats, floats), codegen
+    return _call(builder, "llvm.fmuladd.v16f32", _F16X, *values)
 
 
-@cast(Any, intrinsic)
-def store(typingctx: Any, address: Any, value: Any) -> Any:
+@_operation(types.void, types.int64, floats)
+def store(builder: Any, values: Any) -> None:
     """16 float32 to an address."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[1], _at(builder, args[0], _FLOATS), align=4)
-        return context.get_dummy_value()
-
-    return types.void(types.int64, floats), codegen
+    builder.store(values[1], _at(builder, values[0], _F16X), align=4)
 
 
-@cast(Any, intrinsic)
-def store_colors(typingctx: Any, address: Any, red: Any, green: Any, blue: Any) -> Any:
+@_operation(types.void, types.int64, floats, floats, floats)
+def store_colors(builder: Any, values: Any) -> None:
     """16 colours as red, green, blue, 0 to an address."""
+    red_green = _picked(builder, values[1], values[2], list(range(32)))
+    blue_zero = _picked(builder, values[3], ir.Constant(_F16X, [0.0] * 16), list(range(32)))
+    colors = _picked(builder, red_green, blue_zero, [part * 16 + lane for lane in range(16) for part in range(4)])
+    builder.store(colors, _at(builder, values[0], ir.VectorType(_F32, 64)), align=4)
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pair = ir.Constant(ir.VectorType(ir.IntType(32), 2 * WIDTH), list(range(2 * WIDTH)))
-        turn = [part * WIDTH + lane for lane in range(WIDTH) for part in range(4)]
-        red_green = builder.shuffle_vector(args[1], args[2], pair)
-        blue_zero = builder.shuffle_vector(args[3], ir.Constant(_FLOATS, [0.0] * WIDTH), pair)
-        colors = builder.shuffle_vector(
-            red_green, blue_zero, ir.Constant(ir.VectorType(ir.IntType(32), 4 * WIDTH), turn)
-        )
-        builder.store(colors, _at(builder, args[0], ir.VectorType(ir.FloatType(), 4 * WIDTH)), align=4)
-        return context.get_dummy_value()
 
-    return types.void(types.int64, floats, floats, floats), codegen
+# Four floats: a colour and a pad
+
+
+@_operation(color)
+def black(builder: Any, values: Any) -> Any:
+    """All 0."""
+    return ir.Constant(_F4X, [0.0] * 4)
+
+
+@_operation(color, types.int64)
+def load_color(builder: Any, values: Any) -> Any:
+    """Four float32 from an address."""
+    return _load(builder, values[0], _F4X)
+
+
+@_operation(color, color, types.float32)
+def scaled(builder: Any, values: Any) -> Any:
+    """A colour times a number."""
+    return builder.fmul(values[0], _spread(builder, values[1], _F4X))
+
+
+@_operation(color, color, types.float32, color)
+def scale_add(builder: Any, values: Any) -> Any:
+    """``a * number + c``, rounded once where the machine can."""
+    return _call(builder, "llvm.fmuladd.v4f32", _F4X, values[0], _spread(builder, values[1], _F4X), values[2])
+
+
+@_operation(color, color, color, color)
+def color_add(builder: Any, values: Any) -> Any:
+    """``a * b + c`` channel by channel, rounded once where the machine can."""
+    return _call(builder, "llvm.fmuladd.v4f32", _F4X, *values)
+
+
+@_operation(color, color, color)
+def difference(builder: Any, values: Any) -> Any:
+    """``a - b``."""
+    return builder.fsub(*values)
+
+
+@_operation(color, color, color)
+def plus_size(builder: Any, values: Any) -> Any:
+    """``a + |b|``."""
+    return builder.fadd(values[0], _size(builder, values[1]))
+
+
+@_operation(color, color, color)
+def larger_size(builder: Any, values: Any) -> Any:
+    """The larger of `a` and ``|b|``, `a` where `b` is not a number."""
+    size = _size(builder, values[1])
+    return builder.select(builder.fcmp_ordered(">", size, values[0]), size, values[0])
+
+
+def _size(builder: Any, value: Any) -> Any:
+    kind = ir.VectorType(_I32, 4)
+    bits = builder.and_(builder.bitcast(value, kind), ir.Constant(kind, [0x7FFFFFFF] * 4))
+    return builder.bitcast(bits, _F4X)
+
+
+@_operation(types.void, types.int64, color)
+def store_color(builder: Any, values: Any) -> None:
+    """Four float32 to an address."""
+    builder.store(values[1], _at(builder, values[0], _F4X), align=4)
+
+
+# Integers: products of 16-bit numbers, summed exactly
+
+
+@_operation(integers)
+def no_sum(builder: Any, values: Any) -> Any:
+    """All 0."""
+    return ir.Constant(_I16X, [0] * 16)
+
+
+@_operation(words, types.int64)
+def widen(builder: Any, values: Any) -> Any:
+    """32 int8 from an address."""
+    return builder.sext(_load(builder, values[0], ir.VectorType(_I8, 32)), _W32X)
+
+
+@_operation(words, types.int64)
+def spread_pair(builder: Any, values: Any) -> Any:
+    """The two int16 at an address, 16 times."""
+    pair = builder.load(_at(builder, values[0], _I32), align=4)
+    return builder.bitcast(_spread(builder, pair, _I16X), _W32X)
+
+
+@_operation(integers, words, words, integers)
+def add_dot(builder: Any, values: Any) -> Any:
+    """``x[2i] * y[2i] + x[2i + 1] * y[2i + 1] + sum[i]``: one instruction with AVX-512 VNNI, two with AVX2."""
+    wide = ir.VectorType(_I32, 32)
+    product = builder.mul(builder.sext(values[0], wide), builder.sext(values[1], wide))
+    even = _picked(builder, product, product, list(range(0, 32, 2)))
+    odd = _picked(builder, product, product, list(range(1, 32, 2)))
+    return builder.add(values[2], builder.add(even, odd))
+
+
+@_operation(words, floats, floats)
+def rounded_pairs(builder: Any, values: Any) -> Any:
+    """Pairs ``(a[i], b[i])`` as int16; both below 2^15 in size, rounded to nearest."""
+    # Adding 1.5 * 2^23 leaves the whole number in the low bits of the sum.
+    shift = ir.Constant(_F16X, [12582912.0] * 16)
+    low, high = (builder.bitcast(builder.fadd(value, shift), _I16X) for value in values)
+    low = builder.and_(low, ir.Constant(_I16X, [0xFFFF] * 16))
+    high = builder.shl(high, ir.Constant(_I16X, [16] * 16))
+    return builder.bitcast(builder.or_(low, high), _W32X)
+
+
+@_operation(floats, floats, floats)
+def product(builder: Any, values: Any) -> Any:
+    """``a * b``."""
+    return builder.fmul(*values)
+
+
+@_operation(floats, integers, types.float32)
+def as_floats(builder: Any, values: Any) -> Any:
+    """Integers times a number."""
+    return builder.fmul(builder.sitofp(values[0], _F16X), _spread(builder, values[1], _F16X))
+
+
+@_operation(types.void, types.int64, words)
+def store_words(builder: Any, values: Any) -> None:
+    """32 int16 to an address."""
+    builder.store(values[1], _at(builder, values[0], _W32X), align=4)
+
+
+@_operation(types.void, types.int64)
+def fetch(builder: Any, values: Any) -> None:
+    """Ask for the cache line of an address; it will be read soon."""
+    pointer = ir.IntType(8).as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [pointer, _I32, _I32, _I32])
+    function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
+    read, soon, data = (ir.Constant(_I32, flag) for flag in (0, 2, 1))
+    builder.call(function, [builder.inttoptr(values[0], pointer), read, soon, data])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from icheat_usd.kernels.packed import LANES, multiply_tiles
+from icheat_usd.kernels.packed import LANES, multiply_paired_tiles, multiply_tiles, pair_coefficients
 from icheat_usd.scene import F32, F64, I32, I64
 
 
@@ -29,9 +29,12 @@ def tiles_of(counts: list[int], m: int, seed: int = 0) -> Tiles:
     return Tiles(begin, index, rng.uniform(0.001, 2, n).astype(np.float32), value)
 
 
-def product(tiles: Tiles, coefficients: F32, pair_tile: I32, pair_version: I32) -> F32:
+def product(tiles: Tiles, coefficients: F32, pair_tile: I32, pair_version: I32, *, integers: bool = False) -> F32:
     out = np.full((len(pair_tile), LANES, 4), np.nan, np.float32)
-    multiply_tiles(*tiles, coefficients, pair_tile, pair_version, out)
+    if integers:
+        multiply_paired_tiles(*pair_coefficients(*tiles), coefficients, pair_tile, pair_version, out)
+    else:
+        multiply_tiles(*tiles, coefficients, pair_tile, pair_version, out)
     return out
 
 
@@ -53,10 +56,17 @@ def coefficients_of(n_versions: int, m: int) -> F32:
     return np.random.default_rng(5).normal(size=(n_versions, m, 4)).astype(np.float32)
 
 
-@pytest.mark.parametrize("counts", [[1], [2, 7, 300], [64, 65, 1, 33], [0, 5, 0]])
+COUNTS = [[1], [2, 7, 300], [64, 65, 1, 33], [0, 5, 0]]
+
+
+def all_pairs(n_tiles: int, versions: tuple[int, ...]) -> tuple[I32, I32]:
+    return pairs(*((tile, version) for tile in range(n_tiles) for version in versions))
+
+
+@pytest.mark.parametrize("counts", COUNTS)
 def test_equals_the_product_in_double_precision(counts: list[int]) -> None:
     tiles, coefficients = tiles_of(counts, 400), coefficients_of(3, 400)
-    chosen = pairs(*((tile, version) for tile in range(len(counts)) for version in (2, 0)))
+    chosen = all_pairs(len(counts), (2, 0))
     expected = naive_product(tiles, coefficients, *chosen)
     got = product(tiles, coefficients, *chosen)
     error = np.abs(got - expected).max(axis=(1, 2))
@@ -64,19 +74,50 @@ def test_equals_the_product_in_double_precision(counts: list[int]) -> None:
     assert not got[..., 3].any()
 
 
-def test_a_product_has_the_same_bits_whatever_else_is_computed() -> None:
+@pytest.mark.parametrize("counts", COUNTS)
+def test_integers_stay_within_half_a_step_for_each_coefficient(counts: list[int]) -> None:
+    tiles, coefficients = tiles_of(counts, 400), coefficients_of(3, 400)
+    chosen = all_pairs(len(counts), (2, 0))
+    expected = naive_product(tiles, coefficients, *chosen)
+    got = product(tiles, coefficients, *chosen, integers=True)
+    for p, (tile, version) in enumerate(zip(*chosen, strict=True)):
+        part = slice(tiles.tile_begin[tile], tiles.tile_begin[tile + 1])
+        light = np.abs(coefficients[version, tiles.index[part], :3] * tiles.scale[part, None])
+        half_step = 0.5001 * light.max(axis=0, initial=0) / 32767
+        bound = np.abs(tiles.value[part].astype(np.float64)).sum(axis=0)[:, None] * half_step
+        assert np.all(np.abs(got[p, :, :3] - expected[p, :, :3]) <= bound + 1e-6 * np.abs(expected[p]).max())
+    assert not got[..., 3].any()
+
+
+def test_integers_do_not_overflow_where_everything_adds_up() -> None:
+    n = 3001
+    tiles = tiles_of([n], n)._replace(value=np.full((n, LANES), -128, np.int8), scale=np.ones(n, np.float32))
+    light = np.ones((1, n, 4), np.float32)
+    np.testing.assert_allclose(product(tiles, light, *pairs((0, 0)), integers=True)[..., :3], -128.0 * n, rtol=1e-4)
+
+
+@pytest.mark.parametrize("integers", [False, True])
+def test_darkness_is_exactly_dark(integers: bool) -> None:
+    tiles = tiles_of([5, 64], 100)
+    out = product(tiles, np.zeros((1, 100, 4), np.float32), *all_pairs(2, (0,)), integers=integers)
+    np.testing.assert_array_equal(out, 0)
+
+
+@pytest.mark.parametrize("integers", [False, True])
+def test_a_product_has_the_same_bits_whatever_else_is_computed(integers: bool) -> None:
     tiles, coefficients = tiles_of([31, 64, 200, 5], 256), coefficients_of(2, 256)
-    everything = pairs(*((tile, version) for tile in range(4) for version in range(2)))
+    everything = all_pairs(4, (0, 1))
     results = []
     before = numba.get_num_threads()
     try:
         for n_threads in {1, min(2, numba.config.NUMBA_NUM_THREADS)}:
             numba.set_num_threads(n_threads)
-            results.append(product(tiles, coefficients, *everything))
+            results.append(product(tiles, coefficients, *everything, integers=integers))
     finally:
         numba.set_num_threads(before)
     for p in (1, 4):
-        alone = product(tiles, coefficients, everything[0][p : p + 1], everything[1][p : p + 1])
+        chosen = everything[0][p : p + 1], everything[1][p : p + 1]
+        alone = product(tiles, coefficients, *chosen, integers=integers)
         results.append(np.concatenate([results[0][:p], alone, results[0][p + 1 :]]))
     for other in results[1:]:
         np.testing.assert_array_equal(other, results[0])
