@@ -113,6 +113,22 @@ class Session(ShotParts):
             memory=memory,
         )
 
+    def at(self, frame: float | None) -> Session:
+        """The same stage and choices at another frame."""
+        return Session(
+            self.stage,
+            camera=self.camera,
+            frame=frame,
+            stack=self._stack_path,
+            width=self._size[0],
+            height=self._size[1],
+            quality=self.quality,
+            tracer=self._engine,
+            progress=self.progress,
+            disk=self._disk,
+            memory=self._memory,
+        )
+
     @cached_property
     def snapshot(self) -> SceneSnapshot:
         """The stage at the session's frame."""

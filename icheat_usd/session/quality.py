@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from icheat_usd.final_gather import GatherSettings
 
@@ -30,3 +30,17 @@ DRAFT = Quality(n_gather=8_192, rays_per_row=64, rays_per_bounce_row=64, row_spa
 
 PREVIEW = Quality()
 FINAL = GatherSettings()
+
+
+def coarse(quality: Quality) -> Quality:
+    """What to show within seconds, while a preview of this quality is made."""
+    return replace(
+        quality,
+        n_gather=min(quality.n_gather, 8_192),
+        rays_per_row=min(quality.rays_per_row, 64),
+        rays_per_bounce_row=min(quality.rays_per_bounce_row, 32),
+        row_spacing=max(quality.row_spacing, 8),
+        light_samples=min(quality.light_samples, 2),
+        dome_samples=min(quality.dome_samples or 4, 4),
+        samples_per_pixel=1,
+    )

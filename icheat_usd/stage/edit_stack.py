@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Protocol
@@ -58,6 +58,8 @@ def read_edit_stack(
     time: float | None,
     surface_paths: Iterable[str],
     read_payload: PayloadReader | None = None,
+    *,
+    with_muted: bool = False,
 ) -> tuple[EditStack, tuple[EditFinding, ...]]:
     """Everything the stage says about a stack at one time code.
 
@@ -70,6 +72,9 @@ def read_edit_stack(
     read_payload
         Called for each payload that takes part at `time`. Muted edits, those of amount 0 and those of a stack that is
         off read none.
+    with_muted
+        Read muted edits and those of amount 0 like the others, for someone who will turn them on; what cannot be read
+        of them is left out as if it were not asked for.
 
     Returns
     -------
@@ -91,7 +96,7 @@ def read_edit_stack(
     enabled = read_flag(prim, schema.STACK_ENABLED, time)
     edits = []
     for edit in prims:
-        read, more = _read_edit(edit, time, paths, read_payload, is_used=enabled)
+        read, more = _read_edit(edit, time, paths, read_payload, is_used=enabled, with_muted=with_muted)
         edits.append(read)
         findings += more
     stack = EditStack(path=stack_path, edits=tuple(edits), enabled=enabled)
@@ -106,6 +111,25 @@ def _read_edit(
     read_payload: PayloadReader | None,
     *,
     is_used: bool,
+    with_muted: bool,
+) -> tuple[Edit, list[EditFinding]]:
+    """An edit; of one that is not used only its values, unless `with_muted` asks for what can be read."""
+    if with_muted:
+        try:
+            edit, findings = _read_used(prim, time, surface_paths, read_payload, lambda _: True)
+            return edit, findings if is_used and edit.is_active else []
+        except (EditError, SidecarError):
+            if is_used and _read_used(prim, time, surface_paths, None, lambda _: False)[0].is_active:
+                raise
+    return _read_used(prim, time, surface_paths, read_payload, lambda edit: is_used and edit.is_active)
+
+
+def _read_used(
+    prim: Usd.Prim,
+    time: float | None,
+    surface_paths: frozenset[str],
+    read_payload: PayloadReader | None,
+    is_read: Callable[[Edit], bool],
 ) -> tuple[Edit, list[EditFinding]]:
     path = str(prim.GetPath())
     track = read_keys(prim)
@@ -121,7 +145,7 @@ def _read_edit(
         enabled=read_flag(prim, schema.ENABLED, time),
         occluders=targets(prim, schema.OCCLUDERS),
     )
-    is_used = is_used and edit.is_active
+    is_used = is_read(edit)
     receivers, casters = (_select(prim, name, surface_paths, is_used) for name in (schema.RECEIVERS, schema.CASTERS))
     edit = replace(edit, receivers=receivers, casters=casters)
     findings = [

@@ -1,0 +1,193 @@
+"""One view with its lights and edits, kept at what an artist has changed: a `LiveState` in, an image out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.edits.model import Edit, EditStack
+from icheat_usd.errors import EditError
+from icheat_usd.relight import RelitView
+from icheat_usd.relight.lights import LiveLights
+from icheat_usd.relight.live import LiveRelighter
+from icheat_usd.scene import F32, F64, LightKind, SceneSnapshot
+from icheat_usd.session.live_state import UNCHANGED, EditChange, LightChange, LiveState
+from icheat_usd.session.shot_parts import ShotParts
+from icheat_usd.transport import HeldBack, Transport
+from icheat_usd.transport.packed import PackedTransport
+
+_DARK = (0.0, 0.0, 0.0)
+
+
+class Evaluator:
+    """The live relighter and the live lights of one view, brought to a state by what differs from the last one.
+
+    Not for two threads at once. The same state has the same image, whatever came before.
+    """
+
+    def __init__(self, parts: ShotParts, transport: Transport | PackedTransport, n_light_samples: int) -> None:
+        quality = parts.quality
+        self._snapshot = parts.snapshot
+        self.view = parts.view
+        self.lights = LiveLights(
+            parts.snapshot,
+            parts.tracer,
+            parts.view,
+            parts.gather,
+            parts.bounces,
+            n_bounces=quality.n_bounces,
+            light_samples=n_light_samples,
+            dome_samples=quality.dome_samples,
+            seed=quality.seed,
+        )
+        rows = transport if isinstance(transport, Transport) else transport.source
+        held_back = None
+        if rows is not None:
+            held_back = HeldBack(parts.snapshot, parts.tracer, parts.view, parts.gather, rows)
+        self.relighter = LiveRelighter(
+            parts.snapshot, parts.view, parts.gather, transport, self.lights, held_back=held_back
+        )
+        self._shown = UNCHANGED
+        self._own_rows = {path: row for row, path in reversed(list(enumerate(parts.snapshot.light_paths)))}
+        self._laid: dict[str, tuple[Edit, EditChange, Edit]] = {}
+
+    def show(self, stack: EditStack, state: LiveState) -> None:
+        """Take the edits of a stack and the changes laid over it.
+
+        Raises
+        ------
+        EditError, LightError
+            A value does not fit; the lights are then as before.
+        """
+        if state.lights is not self._shown.lights:
+            self._show_lights(self._shown, state)
+        self.relighter.set_stack(self._laid_over(stack, state))
+        self._shown = state
+
+    def frame(self, out: F32 | None = None) -> F32:
+        """(height, width, 3) float32, scene-linear beauty."""
+        return self.relighter.frame(out)
+
+    def relit(self) -> RelitView:
+        return self.relighter.relit()
+
+    def refine(self) -> bool:
+        """A bounded piece of work towards what the settings ask for; False when nothing is left."""
+        return self.relighter.refine()
+
+    def _laid_over(self, stack: EditStack, state: LiveState) -> EditStack:
+        """As `LiveState.laid_over`; edits that did not change stay the same objects, which is how it is noticed."""
+        laid = state.laid_over(stack)
+        own = {edit.path: edit for edit in stack.edits}
+        edits, known = [], {}
+        for edit in laid.edits:
+            change = state.edits.get(edit.path)
+            if change is None:
+                edits.append(edit)
+                continue
+            before = self._laid.get(edit.path)
+            is_same = before is not None and before[0] is own[edit.path] and before[1] is change
+            kept = before if is_same and before is not None else (own[edit.path], change, edit)
+            known[edit.path] = kept
+            edits.append(kept[2])
+        self._laid = known
+        return EditStack(laid.path, tuple(edits), laid.enabled, laid.digest)
+
+    # Lights -----------------------------------------------------------------------------------------------------------
+
+    def _show_lights(self, before: LiveState, after: LiveState) -> None:
+        wanted = [path for path, change in after.lights.items() if change.added is not None and not change.removed]
+        there = [path for path in self.lights.paths if path not in self._own_rows]
+        # Their order decides the order of sums, and with it the last bits.
+        same = next((i for i, (a, b) in enumerate(zip(there, wanted, strict=False)) if a != b), None)
+        same = min(len(there), len(wanted)) if same is None else same
+        for path in there[same:]:
+            self.lights.remove(self.lights.paths.index(path))
+        for path in wanted[same:]:
+            self._add(path, after.lights[path])
+        nothing = LightChange()
+        for path in dict.fromkeys((*before.lights, *after.lights)):
+            was, now = before.lights.get(path, nothing), after.lights.get(path, nothing)
+            if was is now:
+                continue
+            if path in self._own_rows:
+                for row in self._rows(path):
+                    self._change(row, self._value_of_stage(path), was, now)
+            elif path in wanted[:same]:
+                self._change(self.lights.paths.index(path), None, was, now)
+
+    def _rows(self, path: str) -> list[int]:
+        """Several placements of a prototype share a path."""
+        return [row for row, name in enumerate(self.lights.paths) if name == path]
+
+    def _change(self, row: int, own: LightChange | None, was: LightChange, now: LightChange) -> None:
+        values: dict[str, Any] = {}
+        for name in ("to_world", "radiance", "size", "texture"):
+            old, new = getattr(was, name), getattr(now, name)
+            if old is new or (name != "texture" and old is not None and np.array_equal(old, new)):
+                continue
+            if new is None:
+                new = getattr(own, name) if own is not None else None
+            if new is not None:
+                values[name] = self._to_scene(new) if name == "to_world" else new
+        if values:
+            self.lights.change(row, **values)
+        gain = _DARK if now.removed else now.gain
+        if gain != (_DARK if was.removed else was.gain):
+            self.lights.set_gain(row, gain)
+
+    def _add(self, path: str, change: LightChange) -> None:
+        if change.added is None or change.to_world is None or change.radiance is None:
+            raise EditError(f"{path}: a light that is added needs a place and a radiance")
+        row = self.lights.add(
+            path,
+            LightKind(change.added),
+            to_world=self._to_scene(change.to_world),
+            radiance=change.radiance,
+            size=change.size or (0.0, 0.0),
+            texture=change.texture,
+        )
+        if change.gain != (1.0, 1.0, 1.0):
+            self.lights.set_gain(row, change.gain)
+
+    def _to_scene(self, to_world: F64) -> F32:
+        moved = np.array(to_world, np.float64)
+        moved[:, 3] -= self._snapshot.centre
+        return moved.astype(np.float32)
+
+    def _value_of_stage(self, path: str) -> LightChange:
+        return light_of_stage(self._snapshot, path)
+
+
+def light_of_stage(snapshot: SceneSnapshot, path: str) -> LightChange:
+    """What a stage says about one of its lights, as a complete `LightChange`.
+
+    Raises
+    ------
+    EditError
+        It has no such light.
+    """
+    if path not in snapshot.light_paths:
+        known = ", ".join(snapshot.light_paths) or "none"
+        raise EditError(f"there is no light {path} at this frame; there are {known}")
+    row = snapshot.light_paths.index(path)
+    lights, textures = snapshot.lights, snapshot.textures
+    to_world = lights.to_world[row].astype(np.float64)
+    to_world[:, 3] += snapshot.centre
+    image: F32 = np.zeros((0, 0, 3), np.float32)
+    if lights.texture[row] >= 0:
+        texture = int(lights.texture[row])
+        begin, width, height = (int(t[texture]) for t in (textures.begin, textures.width, textures.height))
+        image = textures.texels[begin : begin + width * height].reshape(height, width, 4)
+    return LightChange(
+        to_world=to_world,
+        radiance=_triple(lights.radiance[row]),
+        size=(float(lights.size[row, 0]), float(lights.size[row, 1])),
+        texture=image,
+    )
+
+
+def _triple(values: Sequence[float] | F32) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
