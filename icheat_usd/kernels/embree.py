@@ -7,12 +7,13 @@ loaded elsewhere next time. Struct layouts are those of Embree 4's ``rtcore_ray.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from llvmlite import ir
 from numba import prange, types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 
@@ -20,8 +21,19 @@ CHUNK = 1024  # rays per buffer: enough to hide its allocation, few enough to ba
 _INVALID = np.uint32(0xFFFFFFFF)
 
 
+class TraceTable(NamedTuple):
+    """What a compiled loop needs to trace: addresses of this process."""
+
+    function: int  #: rtcIntersect16, or rtcIntersect1
+    arguments: int  #: RTCIntersectArguments for packets of similar rays
+    packets: bool
+    scene: int
+    mesh_begin: NDArray[np.int64]
+    instance_mesh: NDArray[np.int32]
+
+
 @cast(Any, intrinsic)  # as a caller sees it: without the typing context
-def _call_1(typingctx: Any, function: Any, scene: Any, ray: Any) -> Any:
+def call_1(typingctx: Any, function: Any, scene: Any, ray: Any) -> Any:
     """``function(scene, ray, NULL)``: rtcIntersect1, rtcOccluded1."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -35,17 +47,23 @@ def _call_1(typingctx: Any, function: Any, scene: Any, ray: Any) -> Any:
 
 
 @cast(Any, intrinsic)  # as a caller sees it: without the typing context
-def _call_packet(typingctx: Any, function: Any, valid: Any, scene: Any, rays: Any) -> Any:
-    """``function(valid, scene, rays, NULL)``: rtcIntersect16, rtcOccluded16."""
+def call_packet(typingctx: Any, function: Any, valid: Any, scene: Any, rays: Any, arguments: Any) -> Any:
+    """``function(valid, scene, rays, arguments)``: rtcIntersect16, rtcOccluded16; arguments 0 for none."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pointer = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [pointer] * 4)
         callee = builder.inttoptr(args[0], kind.as_pointer())
-        builder.call(callee, [builder.inttoptr(a, pointer) for a in args[1:]] + [ir.Constant(pointer, None)])
+        builder.call(callee, [builder.inttoptr(a, pointer) for a in args[1:]])
         return context.get_dummy_value()
 
-    return types.void(types.int64, types.int64, types.int64, types.int64), codegen
+    return types.void(*[types.int64] * 5), codegen
+
+
+@kernel
+def _call_packet(function: int, valid: int, scene: int, rays: int) -> None:
+    """`call_packet` without arguments."""
+    call_packet(function, valid, scene, rays, 0)
 
 
 @kernel
@@ -104,7 +122,7 @@ def intersect_single(
             words[18] = _INVALID
             words[19] = _INVALID
             words[20] = _INVALID
-            _call_1(function, scene, address)
+            call_1(function, scene, address)
             if words[18] != _INVALID:
                 top = np.int64(words[18] if words[19] == _INVALID else words[19])
                 distance[i] = ray[8]
@@ -244,5 +262,5 @@ def occluded_single(
             words[9] = _INVALID
             words[10] = 0
             words[11] = 0
-            _call_1(function, scene, address)
+            call_1(function, scene, address)
             blocked[i] = ray[8] < 0.0

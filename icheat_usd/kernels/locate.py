@@ -12,7 +12,7 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 
 BUCKET = 8  # leaves scanned one by one: a box test costs about as much as two of them
 _BLOCK = 2048  # queries that share a stack
-_AGREE = np.float32(0.5)  # normals at least 60 degrees apart belong to different sheets of a surface
+AGREE = np.float32(0.5)  # normals at least 60 degrees apart belong to different sheets of a surface
 
 
 class LocatorTable(NamedTuple):
@@ -108,7 +108,7 @@ def _nearest(table, begin, end, root, x, y, z, nx, ny, nz, detour, stack, bound)
             dz = sample[j, 2] - z
             d = dx * dx + dy * dy + dz * dz
             if d < best_distance or (d == best_distance and j < best):
-                if sample[j, 3] * nx + sample[j, 4] * ny + sample[j, 5] * nz <= _AGREE:
+                if sample[j, 3] * nx + sample[j, 4] * ny + sample[j, 5] * nz <= AGREE:
                     d += detour
                 if d < best_distance or (d == best_distance and j < best):
                     best_distance = d

@@ -60,16 +60,18 @@ def _owen_scramble_reversed(x: int, seed: int) -> int:
 
 
 @kernel
-def _sobol_second(index: int) -> int:
-    index = np.uint32(index)
-    v = np.uint32(1 << 31)
-    result = np.uint32(0)
-    while index != np.uint32(0):
-        if index & np.uint32(1):
-            result = np.uint32(result ^ v)
-        index = np.uint32(index >> np.uint32(1))
-        v = np.uint32(v ^ np.uint32(v >> np.uint32(1)))
-    return result
+def _taylor_shift(index: int) -> int:
+    """Polynomial over GF(2) with these coefficients, at x + 1 instead of x.
+
+    With the bits reversed, this is the second dimension of the Sobol sequence:
+    its generator matrix is Pascal's triangle modulo 2.
+    """
+    r = np.uint32(index)
+    r = np.uint32(r ^ np.uint32((r & np.uint32(0xAAAAAAAA)) >> np.uint32(1)))
+    r = np.uint32(r ^ np.uint32((r & np.uint32(0xCCCCCCCC)) >> np.uint32(2)))
+    r = np.uint32(r ^ np.uint32((r & np.uint32(0xF0F0F0F0)) >> np.uint32(4)))
+    r = np.uint32(r ^ np.uint32((r & np.uint32(0xFF00FF00)) >> np.uint32(8)))
+    return np.uint32(r ^ np.uint32((r & np.uint32(0xFFFF0000)) >> np.uint32(16)))
 
 
 @kernel
@@ -82,5 +84,5 @@ def sobol_pair(index: int, seed: int) -> tuple[float, float]:
     """
     shuffled = _reverse_bits(_owen_scramble_reversed(_reverse_bits(np.uint32(index)), hash_combine(seed, 0)))
     first = _reverse_bits(_owen_scramble_reversed(shuffled, hash_combine(seed, 1)))
-    second = _reverse_bits(_owen_scramble_reversed(_reverse_bits(_sobol_second(shuffled)), hash_combine(seed, 2)))
+    second = _reverse_bits(_owen_scramble_reversed(_taylor_shift(shuffled), hash_combine(seed, 2)))
     return to_unit(first), to_unit(second)

@@ -74,3 +74,68 @@ def mean_over_segments(begin, values, out):  # type: ignore[no-untyped-def]
             for q in range(begin[i], begin[i + 1]):
                 total += values[q, c]
             out[i, c] = total / (begin[i + 1] - begin[i])
+
+
+@parallel_kernel
+def pack_ints(counts, begin, values, out):  # type: ignore[no-untyped-def]
+    """Copy the first ``counts[r]`` entries of each padded row to ``begin[r]`` of the packed array."""
+    for r in prange(len(counts)):
+        for e in range(counts[r]):
+            out[begin[r] + e] = values[r, e]
+
+
+@parallel_kernel
+def count_union(indptr_a, index_a, indptr_b, index_b, out):  # type: ignore[no-untyped-def]
+    """Number of distinct columns of each row of two matrices together."""
+    for r in prange(len(out)):
+        a, b, count = indptr_a[r], indptr_b[r], 0
+        while a < indptr_a[r + 1] and b < indptr_b[r + 1]:
+            i, j = index_a[a], index_b[b]
+            if i <= j:
+                a += 1
+            if j <= i:
+                b += 1
+            count += 1
+        out[r] = count + indptr_a[r + 1] - a + indptr_b[r + 1] - b
+
+
+@parallel_kernel
+def add_shares(  # type: ignore[no-untyped-def]
+    indptr_a, index_a, weight_a, of_a, indptr_b, index_b, weight_b, of_b, of_out, indptr, index, weight
+):
+    """Sum of two matrices of shares: weights times `of_a` and `of_b` are whole numbers, added as such."""
+    for r in prange(len(indptr) - 1):
+        a, b = indptr_a[r], indptr_b[r]
+        last_a, last_b = indptr_a[r + 1], indptr_b[r + 1]
+        for e in range(indptr[r], indptr[r + 1]):
+            total = 0.0
+            from_a = a < last_a and (b == last_b or index_a[a] <= index_b[b])
+            from_b = b < last_b and (a == last_a or index_b[b] <= index_a[a])
+            if from_a:
+                index[e] = index_a[a]
+                total += np.rint(np.float64(weight_a[a]) * of_a)
+                a += 1
+            if from_b:
+                index[e] = index_b[b]
+                total += np.rint(np.float64(weight_b[b]) * of_b)
+                b += 1
+            weight[e] = total / of_out
+
+
+@parallel_kernel
+def count_below(indptr, index, column, out):  # type: ignore[no-untyped-def]
+    """Entries of each row whose column is less than `column`."""
+    for r in prange(len(out)):
+        e = indptr[r]
+        while e < indptr[r + 1] and index[e] < column:
+            e += 1
+        out[r] = e - indptr[r]
+
+
+@parallel_kernel
+def copy_part(begin, first_column, index, weight, indptr_out, index_out, weight_out):  # type: ignore[no-untyped-def]
+    """Entries from ``begin[r]`` on of each row, as many as the output has, columns counted from `first_column`."""
+    for r in prange(len(begin)):
+        for e in range(indptr_out[r + 1] - indptr_out[r]):
+            index_out[indptr_out[r] + e] = index[begin[r] + e] - first_column
+            weight_out[indptr_out[r] + e] = weight[begin[r] + e]

@@ -143,13 +143,39 @@ def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def unit_circle(turns):  # type: ignore[no-untyped-def]
+    """Cosine and sine of an angle in turns from 0 to 1, to 2e-7: without a call, so loops of it become vector code."""
+    quarter = np.float32(np.floor(np.float32(4.0) * turns + np.float32(0.5)))
+    x = (np.float32(4.0) * turns - quarter) * np.float32(1.5707963267948966)
+    x2 = x * x
+    # Minimax polynomials on a quarter of a turn about zero (Cephes, sinf and cosf).
+    s = x + x * x2 * (
+        np.float32(-1.6666654611e-1) + x2 * (np.float32(8.3321608736e-3) - x2 * np.float32(1.9515295891e-4))
+    )
+    c = np.float32(-1.388731625493765e-3) + x2 * np.float32(2.443315711809948e-5)
+    c = np.float32(1.0) - np.float32(0.5) * x2 + x2 * x2 * (np.float32(4.166664568298827e-2) + x2 * c)
+    turned = np.int32(quarter)
+    odd = (turned & np.int32(1)) != 0
+    cosine, sine = (s, c) if odd else (c, s)
+    if ((turned + np.int32(1)) & np.int32(2)) != 0:
+        cosine = -cosine
+    if (turned & np.int32(2)) != 0:
+        sine = -sine
+    return cosine, sine
+
+
+@kernel
+def cosine_lobe(u, v):  # type: ignore[no-untyped-def]
+    """Unit direction about +z with density cos / pi, from the unit square."""
+    radius = np.float32(np.sqrt(u))
+    cosine, sine = unit_circle(v)
+    return radius * cosine, radius * sine, np.float32(np.sqrt(max(np.float32(0.0), np.float32(1.0) - u)))
+
+
+@kernel
 def cosine_direction(nx, ny, nz, u, v):  # type: ignore[no-untyped-def]
     """Unit direction about a normal with density cos / pi, from the unit square."""
-    radius = np.float32(np.sqrt(u))
-    angle = np.float32(6.283185307179586) * v
-    x = radius * np.float32(np.cos(angle))
-    y = radius * np.float32(np.sin(angle))
-    z = np.float32(np.sqrt(max(np.float32(0.0), np.float32(1.0) - u)))
+    x, y, z = cosine_lobe(u, v)
     tx, ty, tz, bx, by, bz = basis(nx, ny, nz)
     return x * tx + y * bx + z * nx, x * ty + y * by + z * ny, x * tz + y * bz + z * nz
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import parallel_kernel
-from icheat_usd.kernels.locate import nearest_sample
+from icheat_usd.kernels.cell_map import cell_of_hit
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 
 _BLOCK = 2048
@@ -14,7 +14,8 @@ _BLOCK = 2048
 
 @parallel_kernel
 def cells_of_hits(  # type: ignore[no-untyped-def]
-    table,
+    cells,
+    locator,
     depth,
     points,
     to_world,
@@ -28,17 +29,13 @@ def cells_of_hits(  # type: ignore[no-untyped-def]
     cell,
     detour,
 ):
-    """Gather cell of every hit, -1 for none; `detour` marks hits on triangles that do not simply reflect.
-
-    The place comes from barycentrics in double precision, not from the ray: a
-    hit far away then still lies on its triangle.
-    """
+    """Gather cell of every hit, -1 for none; `detour` marks hits on triangles that do not simply reflect."""
     n = len(instance)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
         stack = np.empty((depth + 1, 2), np.int64)
         bound = np.empty(depth + 1, np.float32)
         for q in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            i, t = instance[q], triangle[q]
+            i, t = np.int64(instance[q]), np.int64(triangle[q])
             cell[q] = -1
             detour[q] = 0
             if i < 0:
@@ -46,61 +43,49 @@ def cells_of_hits(  # type: ignore[no-untyped-def]
             if triangle_route[t] != 0:
                 detour[q] = 1
                 continue
-            b1, b2 = np.float64(u[q]), np.float64(v[q])
-            ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
-            ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
-            fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
-            ox, oy, oz = ax + b1 * ex + b2 * fx, ay + b1 * ey + b2 * fy, az + b1 * ez + b2 * fz
-            m = to_world[i]
-            x = m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz + m[0, 3]
-            y = m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz + m[1, 3]
-            z = m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz + m[2, 3]
-            gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
-            w = to_object[i]
-            nx = w[0, 0] * gx + w[1, 0] * gy + w[2, 0] * gz
-            ny = w[0, 1] * gx + w[1, 1] * gy + w[2, 1] * gz
-            nz = w[0, 2] * gx + w[1, 2] * gy + w[2, 2] * gz
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if not length > 0.0:
-                continue
-            side = 0
-            scale = 1.0 / length
-            if nx * directions[q, 0] + ny * directions[q, 1] + nz * directions[q, 2] > 0.0:
-                side = 1
-                scale = -scale
-            cell[q] = nearest_sample(
-                table,
+            cell[q] = cell_of_hit(
+                cells,
+                locator,
+                points,
+                to_world,
+                to_object,
                 i,
-                side,
-                np.float32(x),
-                np.float32(y),
-                np.float32(z),
-                np.float32(nx * scale),
-                np.float32(ny * scale),
-                np.float32(nz * scale),
+                t,
+                u[q],
+                v[q],
+                directions[q, 0],
+                directions[q, 1],
+                directions[q, 2],
                 stack,
                 bound,
             )
 
 
 @parallel_kernel
-def merge_counts(cell, n_rays, counts, out_cell, out_weight):  # type: ignore[no-untyped-def]
-    """Row r of the output: the distinct cells of its `n_rays` entries of `cell`, each with its share of rays."""
-    unit = np.float32(1.0 / n_rays)
+def pack_units(counts, begin, key, hits, units, out_key, out_units):  # type: ignore[no-untyped-def]
+    """Copy the first ``counts[r]`` entries of each padded row to ``begin[r]``, hits as units of light."""
     for r in prange(len(counts)):
-        keys = np.sort(cell[r * n_rays : (r + 1) * n_rays])
-        count = 0
-        e = 0
-        while e < n_rays and keys[e] < 0:
-            e += 1
-        while e < n_rays:
-            first = e
-            while e < n_rays and keys[e] == keys[first]:
-                e += 1
-            out_cell[r, count] = keys[first]
-            out_weight[r, count] = (e - first) * unit
-            count += 1
-        counts[r] = count
+        for e in range(counts[r]):
+            out_key[begin[r] + e] = key[r, e]
+            out_units[begin[r] + e] = np.float32(hits[r, e]) * np.float32(units)
+
+
+@parallel_kernel
+def divide(values, divisor):  # type: ignore[no-untyped-def]
+    """Divide values (n,) in place, in double precision."""
+    n = len(values)
+    for block in prange((n + _BLOCK - 1) // _BLOCK):
+        for e in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
+            values[e] = values[e] / divisor
+
+
+@parallel_kernel
+def ray_counters(seed, stream, n_rays, out):  # type: ignore[no-untyped-def]
+    """A number of its own for ``r * n_rays + k``, ray k of the sequence ``(seed, stream[r])``."""
+    for r in prange(len(stream)):
+        row_seed = hash_combine(seed, stream[r])
+        for k in range(n_rays):
+            out[r * n_rays + k] = np.int32(hash_combine(row_seed, k))
 
 
 @parallel_kernel

@@ -29,7 +29,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from icheat_usd.errors import IcheatError
-from icheat_usd.kernels.embree import intersect_packets, intersect_single, occluded_packets, occluded_single
+from icheat_usd.kernels.embree import (
+    TraceTable,
+    intersect_packets,
+    intersect_single,
+    occluded_packets,
+    occluded_single,
+)
 from icheat_usd.scene import F32, Bool, Geometry, Hits, SceneSnapshot
 from icheat_usd.tracing._rays import checked_rays
 
@@ -91,6 +97,23 @@ def _library() -> ctypes.CDLL:
 @functools.cache
 def _address(name: str) -> int:
     return ctypes.cast(getattr(_library(), name), ctypes.c_void_p).value or 0
+
+
+class _Arguments(ctypes.Structure):
+    """RTCIntersectArguments of Embree 4."""
+
+    _fields_ = [
+        ("flags", ctypes.c_uint),
+        ("feature_mask", ctypes.c_uint),
+        ("context", ctypes.c_void_p),
+        ("filter", ctypes.c_void_p),
+        ("intersect", ctypes.c_void_p),
+        ("reserved", ctypes.c_void_p * 4),
+    ]
+
+
+# For packets of rays that were put in order of direction: two to three times as fast. For others, half as fast.
+_COHERENT = _Arguments(1 << 16, 0xFFFFFFFF)
 
 
 def _release(library: ctypes.CDLL, device: int, scenes: list[int]) -> None:
@@ -232,6 +255,19 @@ class EmbreeTracer:
         name = "rtcOccluded16" if packets else "rtcOccluded1"
         trace(_address(name), self._scene, origins, directions, t_max, blocked)
         return blocked
+
+    def compiled(self) -> TraceTable:
+        """See `Tracer.compiled`."""
+        self._require_open()
+        packets = self._n_placed <= INSTANCES_FOR_PACKETS
+        return TraceTable(
+            _address("rtcIntersect16" if packets else "rtcIntersect1"),
+            ctypes.addressof(_COHERENT),
+            packets,
+            self._scene,
+            self._mesh_begin,
+            self._instance_mesh,
+        )
 
     def _require_open(self) -> None:
         if not self._scene:

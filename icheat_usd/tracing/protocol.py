@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from icheat_usd.errors import IcheatError
 from icheat_usd.scene import F32, Bool, Hits, SceneSnapshot, SurfacePoints
+
+if TYPE_CHECKING:
+    from icheat_usd.kernels.embree import TraceTable
 
 
 class Tracer(Protocol):
@@ -31,6 +34,10 @@ class Tracer(Protocol):
 
     def occluded(self, origins: F32, directions: F32, t_max: F32 | float | None = None) -> Bool:
         """(n,) whether `intersect` would hit anything."""
+        ...
+
+    def compiled(self) -> TraceTable | None:
+        """What compiled loops need to trace rays by themselves, while this tracer is open; None if they cannot."""
         ...
 
     def close(self) -> None:

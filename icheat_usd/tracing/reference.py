@@ -47,6 +47,9 @@ class ReferenceTracer:
     def close(self) -> None:
         """Nothing to release; here because the fast tracer has it."""
 
+    def compiled(self) -> None:
+        """See `Tracer.compiled`."""
+
     def intersect(self, origins: F32, directions: F32, t_max: F32 | float | None = None) -> Hits:
         """See `Tracer.intersect`."""
         origins, directions, t_max = checked_rays(origins, directions, t_max)

@@ -97,10 +97,13 @@ class _BehindOccluders(RowBuilder):
         super().__init__(snapshot, tracer, gather, seed)
         self._clear, self._hidden = clear, hidden
 
-    def _cells(self, origins: F32, directions: F32, seed: int) -> tuple[I32, F32 | None]:
-        counters = np.arange(len(origins), dtype=np.int32)
+    def _trace_table(self) -> None:
+        """Rays are traced through two scenes, which compiled loops do not do."""
+
+    def _cells(self, origins: F32, directions: F32, counters: I32, seed: int) -> tuple[I32, F32 | None]:
         cell, weight = np.full(len(origins), -1, np.int32), np.zeros(len(origins), np.float32)
-        instance = first_surfaces(self._snapshot, self._tracer, origins, directions, seed).points.instance
+        met = first_surfaces(self._snapshot, self._tracer, origins, directions, seed, counters=counters)
+        instance = met.points.instance
         held = np.flatnonzero((instance >= 0) & self._hidden[np.maximum(instance, 0)])
         # The same random numbers take the ray the same way up to the occluder.
         ends = first_surfaces(

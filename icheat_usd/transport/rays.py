@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.kernels import gather_rows as gather_kernels
 from icheat_usd.kernels import rows as row_kernels
 from icheat_usd.kernels import transport as kernels
+from icheat_usd.kernels.embree import TraceTable
 from icheat_usd.kernels.random import hash_combine
-from icheat_usd.kernels.samples import cosine_rays
 from icheat_usd.materials import sample_specular, take_points
-from icheat_usd.progress import Progress
+from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples
+from icheat_usd.samples.cell_map import CellMap, build_cell_map
 from icheat_usd.scene import F32, I32, I64, U8, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
-from icheat_usd.transport.sparse import SparseRows, concatenate_rows
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points, transmittance
+from icheat_usd.transport.sky import SkyBins
+from icheat_usd.transport.sparse import SparseRows, add_shares, concatenate_rows, split_columns
 
 _RAYS_AT_ONCE = 1 << 20
+_UNITS = 1024  # of a ray: counts stay whole numbers where mirrors and glass let part of its light through
+_LANES_PER_THREAD = 4  # few lanes are few counters, several even out the rows' cost
 _DETOUR_DEPTH = 8  # mirrors and faces of glass on a gather ray: what is trapped for longer is darkness to the row
 _WEAK_SPECULAR = 0.2  # reflectance at normal incidence; dielectrics have 0.02 to 0.17
 
@@ -32,6 +39,22 @@ def routed_triangles(snapshot: SceneSnapshot) -> U8:
     dark = (m.metallic > 0.99) | textured[:, 3] | textured[:, 0] | np.all(m.diffuse <= 0, axis=1)
     dark |= m.use_display_color.astype(bool)
     return (opacity | (smooth & dark)).astype(np.uint8)[snapshot.geometry.material]
+
+
+class MeasuredRows(NamedTuple):
+    """Where the rays of rows end, as shares of `n_rays`."""
+
+    cells: SparseRows  #: (n_rows x n_gather)
+    sky: SparseRows  #: (n_rows x bins) rays that leave the scene; without entries where no sky was asked for
+    n_rays: int
+
+    def continued(self, more: MeasuredRows) -> MeasuredRows:
+        """These rows and further rays of the same rows: the same, bit for bit, as all rays measured at once."""
+        before, after = self.n_rays * _UNITS, more.n_rays * _UNITS
+        cells, sky = (
+            add_shares(a, before, b, after, before + after) for a, b in ((self.cells, more.cells), (self.sky, more.sky))
+        )
+        return MeasuredRows(cells, sky, self.n_rays + more.n_rays)
 
 
 class RowBuilder:
@@ -52,30 +75,153 @@ class RowBuilder:
         step: str,
     ) -> SparseRows:
         """Rows of cosine-distributed rays; row r starts from points ``point_begin[r]:point_begin[r + 1]``."""
-        seed = self._seed_for(purpose)
-        clear = spawn_points(self._snapshot, points, points.normal)
+        return self.measure(points, point_begin, stream, n_rays, purpose, progress, step).cells
+
+    def measure(
+        self,
+        points: SurfacePoints,
+        point_begin: I64,
+        stream: I64,
+        n_rays: int,
+        purpose: int,
+        progress: Progress = silent,
+        step: str = "gather rays",
+        *,
+        first_ray: int = 0,
+        of_rays: int | None = None,
+        sky: SkyBins | None = None,
+    ) -> MeasuredRows:
+        """Rows of cosine-distributed rays, and where in the sky the rays end that leave the scene.
+
+        Parameters
+        ----------
+        point_begin : (n_rows + 1,)
+            Row r starts from points ``point_begin[r]:point_begin[r + 1]``.
+        stream : (n_rows,)
+            Number of each row's sequence of rays.
+        purpose
+            Rows of different purposes have different rays.
+        first_ray
+            Rays ``first_ray:first_ray + n_rays`` of the sequence are traced; see `MeasuredRows.continued`.
+        of_rays
+            How many there will be in all, over which the points of a row are spread.
+        sky
+            Bins for rays that leave the scene. Glass and cut-outs on the way let them through straight, as
+            they do with direct light.
+
+        Notes
+        -----
+        Bitwise the same for any number of threads, and each row the same whatever rows it is measured with.
+        Memory: 64 MB beside the rows.
+        """
+        rays = _Rays(
+            spawn_points(self._snapshot, points, points.normal),
+            np.require(points.shading_normal, np.float32, ["C", "W"]),
+            np.require(points.normal, np.float32, ["C", "W"]),
+            np.require(point_begin, np.int64, ["C", "W"]),
+            np.require(stream, np.int64, ["C", "W"]),
+            self._seed_for(purpose),
+            first_ray,
+            n_rays,
+            first_ray + n_rays if of_rays is None else of_rays,
+        )
+        table = self._trace_table()
+        n_keys = self._gather.n + (sky.n if sky else 0)
+        counter = _Counter(n_keys)
 
         def row_chunk(first: int, last: int) -> SparseRows:
-            n = (last - first) * n_rays
-            origins, directions = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-            cosine_rays(
-                clear,
-                points.shading_normal,
-                points.normal,
-                point_begin[first : last + 1],
-                n_rays,
-                seed,
-                stream[first:last],
-                np.empty(n, np.int64),
-                origins,
-                directions,
-            )
-            cell, weight = self._cells(origins, directions, _mix(seed, 1 + first))
-            if weight is None:
-                return self._merge_counts(cell, n_rays)
-            return self._merge(cell, weight[:, None] / np.float32(n_rays), n_rays)[0]
+            part = rays.rows(first, last)
+            if table is not None:
+                return self._count_hits(table, part, sky, counter)
+            n = last - first
+            row, ray = np.repeat(np.arange(n), n_rays), np.tile(np.arange(first_ray, first_ray + n_rays), n)
+            return _counted(row, *self._ends(part, row, ray, sky), n, n_keys)
 
-        return self._in_chunks(len(stream), n_rays, row_chunk, progress, step)
+        units = self._in_chunks(len(stream), n_rays, row_chunk, progress, step, n_columns=n_keys)
+        kernels.divide(units.weights, float(_UNITS * n_rays))
+        cells, in_sky = split_columns(units, self._gather.n)
+        return MeasuredRows(cells, in_sky, n_rays)
+
+    def _trace_table(self) -> TraceTable | None:
+        return self._tracer.compiled()
+
+    def _count_hits(self, trace: TraceTable, rays: _Rays, sky: SkyBins | None, counter: _Counter) -> SparseRows:
+        """Units of light that arrive from cells and, in columns behind them, bins of the sky."""
+        geometry, gather = self._snapshot.geometry, self._gather
+        n = len(rays.stream)
+        count, n_detours = np.empty(n, np.int64), np.empty(n, np.int64)
+        key, hits = (np.empty((n, min(rays.n_rays, counter.n_keys)), np.int32) for _ in range(2))
+        detour = np.empty((n, rays.n_rays), np.int32)
+        gather_kernels.count_hits(
+            trace,
+            self._cell_map.table,
+            gather.locator.table,
+            gather.locator.depth,
+            geometry.points,
+            geometry.instance_to_world,
+            geometry.instance_to_object,
+            self._route,
+            rays.position,
+            rays.shading_normal,
+            rays.normal,
+            rays.point_begin,
+            rays.stream,
+            rays.seed,
+            rays.first_ray,
+            rays.n_rays,
+            rays.of_rays,
+            gather.n,
+            sky.resolution if sky else 0,
+            counter.count,
+            counter.mark,
+            count,
+            key,
+            hits,
+            n_detours,
+            detour,
+        )
+        begin = np.concatenate([[0], np.cumsum(count)])
+        rows = SparseRows(begin, np.empty(begin[-1], np.int32), np.empty(begin[-1], np.float32), counter.n_keys)
+        kernels.pack_units(count, begin, key, hits, _UNITS, rows.indices, rows.weights)
+        begin = np.concatenate([[0], np.cumsum(n_detours)])
+        if begin[-1] == 0:
+            return rows
+        ray = np.empty(begin[-1], np.int32)
+        row_kernels.pack_ints(n_detours, begin, detour, ray)
+        row = np.repeat(np.arange(n), n_detours)
+        return add_shares(rows, 1, _counted(row, *self._ends(rays, row, ray, sky), n, counter.n_keys), 1, 1)
+
+    def _ends(self, rays: _Rays, row: I64, ray: I32 | I64, sky: SkyBins | None) -> tuple[I64, I64, I64]:
+        """Where some rays end: number of the ray in `row`, column and units of light."""
+        n = len(row)
+        origins, directions = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+        counter = np.empty(n, np.int32)
+        gather_kernels.rays_of_rows(
+            rays.position,
+            rays.shading_normal,
+            rays.normal,
+            rays.point_begin,
+            rays.stream,
+            rays.seed,
+            rays.of_rays,
+            row,
+            ray,
+            origins,
+            directions,
+            counter,
+        )
+        cell, weight = self._cells(origins, directions, counter, rays.seed)
+        which = np.flatnonzero(cell >= 0)
+        units = np.full(n, _UNITS) if weight is None else np.rint(weight * np.float32(_UNITS)).astype(np.int64)
+        column, units = cell[which].astype(np.int64), units[which]
+        if sky is not None:
+            open_rays = np.flatnonzero(directions.any(axis=1))
+            share = transmittance(self._snapshot, self._tracer, origins[open_rays], directions[open_rays]).mean(axis=1)
+            bins = self._gather.n + sky.of_directions(directions[open_rays]).astype(np.int64)
+            which = np.concatenate([which, open_rays])
+            column = np.concatenate([column, bins])
+            units = np.concatenate([units, np.rint(share * np.float32(_UNITS)).astype(np.int64)])
+        return which, column, units
 
     def specular_rows(
         self, points: SurfacePoints, to_eye: F32, stream: I64, glossy: I64, n_rays: int, progress: Progress
@@ -99,7 +245,9 @@ class RowBuilder:
                 many = take_points(points, start)
                 directions, to_base, to_edge = sample_specular(many, np.ascontiguousarray(to_eye[start]), u)
                 origins = spawn_points(self._snapshot, many, directions)
-                cell, weight = self._cells(origins, directions, _mix(seed, 1 + int(rows[first])))
+                counter = np.empty(len(start), np.int32)
+                kernels.ray_counters(seed, stream[rows[first:last]], rays, counter)
+                cell, weight = self._cells(origins, directions, counter, seed)
                 both = np.stack([to_base, to_edge], axis=1) / np.float32(rays)
                 base, edge = self._merge(cell, both if weight is None else both * weight[:, None], rays)
                 second.append(edge)
@@ -129,6 +277,7 @@ class RowBuilder:
         progress: Progress,
         step: str,
         rays_at_once: int = _RAYS_AT_ONCE,
+        n_columns: int | None = None,
     ) -> SparseRows:
         parts = []
         at_once = max(1, rays_at_once // n_rays)
@@ -137,15 +286,16 @@ class RowBuilder:
             last = min(first + at_once, n_rows)
             parts.append(row_chunk(first, last))
             progress(step, last / n_rows)
-        return concatenate_rows(parts, self._gather.n)
+        return concatenate_rows(parts, n_columns or self._gather.n)
 
-    def _cells(self, origins: F32, directions: F32, seed: int) -> tuple[I32, F32 | None]:
+    def _cells(self, origins: F32, directions: F32, counters: I32, seed: int) -> tuple[I32, F32 | None]:
         """Cell that each ray ends in and its throughput; None for the throughput where it is 1 for all."""
         hits = self._tracer.intersect(origins, directions)
         cell = np.empty(len(origins), np.int32)
         detour = np.empty(len(origins), np.uint8)
         geometry, locator = self._snapshot.geometry, self._gather.locator
         kernels.cells_of_hits(
+            self._cell_map.table,
             locator.table,
             locator.depth,
             geometry.points,
@@ -163,22 +313,17 @@ class RowBuilder:
         rest = np.flatnonzero(detour)
         if not len(rest):
             return cell, None
-        ends = first_surfaces(self._snapshot, self._tracer, origins[rest], directions[rest], seed, _DETOUR_DEPTH)
+        ends = first_surfaces(
+            self._snapshot, self._tracer, origins[rest], directions[rest], seed, _DETOUR_DEPTH, counters[rest]
+        )
         cell[rest] = self._gather.locate(ends.points)
         weight = np.ones(len(cell), np.float32)
         weight[rest] = ends.throughput.mean(axis=1)
         return cell, weight
 
-    def _merge_counts(self, cell: I32, n_rays: int) -> SparseRows:
-        n = len(cell) // n_rays
-        counts = np.empty(n, np.int64)
-        merged = np.empty((n, n_rays), np.int32)
-        weights = np.empty((n, n_rays), np.float32)
-        kernels.merge_counts(cell, n_rays, counts, merged, weights)
-        indptr = np.concatenate([[0], np.cumsum(counts)])
-        rows = SparseRows(indptr, np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32), self._gather.n)
-        row_kernels.pack_rows(counts, indptr, merged, weights, rows.indices, rows.weights)
-        return rows
+    @cached_property
+    def _cell_map(self) -> CellMap:
+        return self._gather.cell_map or build_cell_map(self._snapshot.geometry, self._gather.locator)
 
     def _merge(self, cell: I32, weight: F32, n_rays: int) -> tuple[SparseRows, F32]:
         """Rows of the first column of `weight` (n, k), and the last column's weights of the same entries."""
@@ -191,6 +336,45 @@ class RowBuilder:
         packed = np.empty((weight.shape[1], indptr[-1]), np.float32)
         kernels.pack_weights(n_rays, counts, indptr, merged, weights, indices, packed)
         return SparseRows(indptr, indices, packed[0], self._gather.n), packed[-1]
+
+
+class _Rays(NamedTuple):
+    """Rays of some rows, made from counters wherever they are needed."""
+
+    position: F32  # (p, 3) clear of the surface
+    shading_normal: F32
+    normal: F32
+    point_begin: I64  # (n_rows + 1,)
+    stream: I64  # (n_rows,)
+    seed: int
+    first_ray: int
+    n_rays: int
+    of_rays: int
+
+    def rows(self, first: int, last: int) -> _Rays:
+        return self._replace(point_begin=self.point_begin[first : last + 1], stream=self.stream[first:last])
+
+
+class _Counter:
+    """Zeros that the kernel counts on, some lanes for each thread."""
+
+    def __init__(self, n_keys: int) -> None:
+        lanes = _LANES_PER_THREAD * gather_kernels.thread_count()
+        self.n_keys = n_keys
+        self.count = np.zeros((lanes, n_keys), np.int32)
+        self.mark = np.zeros((lanes, -(-n_keys // 64)), np.uint64)
+
+
+def _counted(row: I64, which: I64, column: I64, units: I64, n_rows: int, n_columns: int) -> SparseRows:
+    """Rows of added units; entry e belongs to row ``row[which[e]]``."""
+    code = row[which] * n_columns + column
+    order = np.argsort(code[units > 0], kind="stable")
+    code, units = code[units > 0][order], units[units > 0][order]
+    first = np.flatnonzero(np.concatenate([[True], code[1:] != code[:-1]])[: len(code)])
+    total = np.add.reduceat(units, first) if len(first) else units
+    code = code[first]
+    indptr = np.searchsorted(code, np.arange(n_rows + 1) * n_columns)
+    return SparseRows(indptr, (code % n_columns).astype(np.int32), total.astype(np.float32), n_columns)
 
 
 def _mix(seed: int, value: int) -> int:

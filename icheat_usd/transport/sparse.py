@@ -90,3 +90,52 @@ def concatenate_rows(parts: list[SparseRows], n_columns: int) -> SparseRows:
         row += part.n_rows
         entry += part.n_entries
     return SparseRows(indptr, indices, weights, n_columns)
+
+
+def add_shares(a: SparseRows, of_a: float, b: SparseRows, of_b: float, of_sum: float) -> SparseRows:
+    """Sum of two matrices of counts that were divided: ``(a * of_a + b * of_b) / of_sum``, exact in the counts.
+
+    Parameters
+    ----------
+    of_a, of_b, of_sum
+        What the counts of each matrix were divided by, and those of the sum will be.
+    """
+    counts = np.empty(a.n_rows, np.int64)
+    kernels.count_union(a.indptr, a.indices, b.indptr, b.indices, counts)
+    indptr = np.concatenate([[0], np.cumsum(counts)])
+    out = SparseRows(indptr, np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32), a.n_columns)
+    kernels.add_shares(
+        a.indptr,
+        a.indices,
+        a.weights,
+        float(of_a),
+        b.indptr,
+        b.indices,
+        b.weights,
+        float(of_b),
+        float(of_sum),
+        out.indptr,
+        out.indices,
+        out.weights,
+    )
+    return out
+
+
+def split_columns(rows: SparseRows, column: int) -> tuple[SparseRows, SparseRows]:
+    """The columns before `column` and those from it on, as two matrices."""
+    counts = np.empty(rows.n_rows, np.int64)
+    kernels.count_below(rows.indptr, rows.indices, column, counts)
+    parts = []
+    for begin, number, first in (
+        (rows.indptr[:-1], counts, 0),
+        (rows.indptr[:-1] + counts, np.diff(rows.indptr) - counts, column),
+    ):
+        width = rows.n_columns - column if first else column
+        indptr = np.concatenate([[0], np.cumsum(number)])
+        if indptr[-1] == rows.n_entries and not first:
+            parts.append(SparseRows(indptr, rows.indices, rows.weights, width))
+            continue
+        part = SparseRows(indptr, np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32), width)
+        kernels.copy_part(begin, first, rows.indices, rows.weights, part.indptr, part.indices, part.weights)
+        parts.append(part)
+    return parts[0], parts[1]

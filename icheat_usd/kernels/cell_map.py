@@ -1,0 +1,391 @@
+"""Gather cell of a hit by a table over the triangles: what a walk down the cluster tree finds, in a step or two.
+
+Every side of every placed triangle is divided by a grid in its barycentric
+coordinates. A square of the grid names the one sample that is nearest all
+over it, or the few that are nearest somewhere in it; only among these are
+distances compared, exactly as `nearest_sample` compares them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.locate import AGREE, nearest_sample
+
+WALK = -(1 << 31)  # an entry without candidates: walk down the tree
+NO_FACES = -(1 << 40)  # a placement without entries
+BLOCK = 4  # squares along a side of a block, which shares one search for candidates
+MOST = 12  # candidates of a square; more are looked up in the tree
+_SEARCHED = 512  # candidates of a block
+_FINEST = 4096  # squares along an edge
+
+
+class CellTable(NamedTuple):
+    """Entries are a sample, or ``-1 - first`` of a list in `candidates`, or `WALK`."""
+
+    place: NDArray[np.int64]  #: (n_instances,) added to a triangle's row gives its placed triangle; or `NO_FACES`
+    face: NDArray[np.int32]  #: (2 * n_placed, 3) of each side: entry; or first square, squares along each edge
+    square: NDArray[np.int32]  #: entries of the squares of divided sides
+    candidates: NDArray[np.int32]  #: lists: how many, then samples, ascending
+
+
+@kernel
+def placed_triangle(points, to_world, i, t):  # type: ignore[no-untyped-def]
+    """First corner and two edges in world space, double precision."""
+    ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
+    ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
+    fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
+    m = to_world[i]
+    return (
+        (
+            m[0, 0] * ax + m[0, 1] * ay + m[0, 2] * az + m[0, 3],
+            m[1, 0] * ax + m[1, 1] * ay + m[1, 2] * az + m[1, 3],
+            m[2, 0] * ax + m[2, 1] * ay + m[2, 2] * az + m[2, 3],
+        ),
+        (
+            m[0, 0] * ex + m[0, 1] * ey + m[0, 2] * ez,
+            m[1, 0] * ex + m[1, 1] * ey + m[1, 2] * ez,
+            m[2, 0] * ex + m[2, 1] * ey + m[2, 2] * ez,
+        ),
+        (
+            m[0, 0] * fx + m[0, 1] * fy + m[0, 2] * fz,
+            m[1, 0] * fx + m[1, 1] * fy + m[1, 2] * fz,
+            m[2, 0] * fx + m[2, 1] * fy + m[2, 2] * fz,
+        ),
+    )
+
+
+@kernel
+def plane_of(points, to_object, i, t):  # type: ignore[no-untyped-def]
+    """Normal of the front in world space, double precision, not normalised; zero of a degenerate triangle."""
+    ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
+    ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
+    fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
+    gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+    w = to_object[i]
+    return (
+        w[0, 0] * gx + w[1, 0] * gy + w[2, 0] * gz,
+        w[0, 1] * gx + w[1, 1] * gy + w[2, 1] * gz,
+        w[0, 2] * gx + w[1, 2] * gy + w[2, 2] * gz,
+    )
+
+
+@kernel
+def place_on(points, to_world, i, t, u, v):  # type: ignore[no-untyped-def]
+    """Place on a triangle in world space, rounded once: a hit far from its ray's origin lies on its triangle."""
+    b1, b2 = np.float64(u), np.float64(v)
+    ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
+    ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
+    fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
+    ox, oy, oz = ax + b1 * ex + b2 * fx, ay + b1 * ey + b2 * fy, az + b1 * ez + b2 * fz
+    m = to_world[i]
+    return (
+        np.float32(m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz + m[0, 3]),
+        np.float32(m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz + m[1, 3]),
+        np.float32(m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz + m[2, 3]),
+    )
+
+
+@kernel
+def cell_of_hit(cells, locator, points, to_world, to_object, i, t, u, v, dx, dy, dz, stack, bound):  # type: ignore[no-untyped-def]
+    """Gather cell that a ray of direction ``(dx, dy, dz)`` hits; -1 on a degenerate triangle."""
+    px, py, pz = plane_of(points, to_object, i, t)
+    length2 = px * px + py * py + pz * pz
+    if not length2 > 0.0:
+        return np.int64(-1)
+    side = 1 if px * dx + py * dy + pz * dz > 0.0 else 0
+    entry = np.int64(WALK)
+    first = cells.place[i]
+    if first != NO_FACES:
+        f = 2 * (first + t) + side
+        entry = np.int64(cells.face[f, 0])
+        along_u, along_v = cells.face[f, 1], cells.face[f, 2]
+        if along_u > 0:
+            a = min(max(np.int64(u * np.float32(along_u)), 0), np.int64(along_u - 1))
+            b = min(max(np.int64(v * np.float32(along_v)), 0), np.int64(along_v - 1))
+            entry = np.int64(cells.square[entry + b * along_u + a])
+        if entry >= 0:
+            return entry
+    x, y, z = place_on(points, to_world, i, t, u, v)
+    scale = 1.0 / np.sqrt(length2)
+    if side == 1:
+        scale = -scale
+    nx, ny, nz = np.float32(px * scale), np.float32(py * scale), np.float32(pz * scale)
+    if entry == WALK:
+        return nearest_sample(locator, i, side, x, y, z, nx, ny, nz, stack, bound)
+    detour = locator.slot_detour[locator.slot[2 * i + side]]
+    sample = locator.sample
+    begin = -entry
+    best = np.int64(cells.candidates[begin])
+    best_distance = np.float32(np.inf)
+    for e in range(begin, begin + cells.candidates[begin - 1]):
+        j = cells.candidates[e]
+        ex, ey, ez = sample[j, 0] - x, sample[j, 1] - y, sample[j, 2] - z
+        d = ex * ex + ey * ey + ez * ez
+        if d < best_distance:
+            if sample[j, 3] * nx + sample[j, 4] * ny + sample[j, 5] * nz <= AGREE:
+                d += detour
+            if d < best_distance:
+                best_distance = d
+                best = np.int64(j)
+    return best
+
+
+@parallel_kernel
+def divide_faces(points, to_world, locator, spacing, fineness, placed_instance, place, out):  # type: ignore[no-untyped-def]
+    """Squares along both edges of every side of the placed triangles, (2 n, 2); 0 where a side has one sample.
+
+    `spacing` (n_slots,) is the mean distance of samples, `fineness` the size of a square in these.
+    """
+    for p in prange(len(placed_instance)):
+        i = placed_instance[p]
+        _, e, f = placed_triangle(points, to_world, i, p - place[i])
+        e2 = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
+        f2 = f[0] * f[0] + f[1] * f[1] + f[2] * f[2]
+        ef = e[0] * f[0] + e[1] * f[1] + e[2] * f[2]
+        area = np.sqrt(max(0.0, e2 * f2 - ef * ef))
+        for side in range(2):
+            slot = locator.slot[2 * i + side]
+            out[2 * p + side, 0] = 0
+            out[2 * p + side, 1] = 0
+            if locator.slot_begin[slot + 1] - locator.slot_begin[slot] == 1:
+                continue
+            size = fineness * spacing[slot]
+            along_u, along_v = np.sqrt(e2) / size, np.sqrt(f2) / size
+            # Slivers: long edges, but few samples.
+            limit = 4.0 + 4.0 * area / (size * size)
+            if not along_u * along_v <= limit:
+                shrink = np.sqrt(limit / (along_u * along_v))
+                along_u, along_v = along_u * shrink, along_v * shrink
+            out[2 * p + side, 0] = np.int32(min(max(np.ceil(along_u), 1.0), _FINEST))
+            out[2 * p + side, 1] = np.int32(min(max(np.ceil(along_v), 1.0), _FINEST))
+
+
+@kernel
+def _within(locator, begin, end, root, c, n, detour, radius, reach2, stack, found):  # type: ignore[no-untyped-def]
+    """Samples that may be nearest to a place no further than `radius` from `c`; their number, or -1 for too many."""
+    record, sample = locator.record, locator.sample
+    count = 0
+    stack[0, 0], stack[0, 1] = (root, 0) if root >= 0 else (-1 - begin, end - begin)
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        what, number = stack[depth, 0], stack[depth, 1]
+        if what >= 0:
+            for first in (8, 0):
+                d2 = 0.0
+                for a in range(3):
+                    low, high = record[what, first + a] - c[a], c[a] - record[what, first + 3 + a]
+                    d2 += max(low, high, 0.0) ** 2
+                if max(0.0, np.sqrt(d2) - radius) ** 2 <= reach2:
+                    stack[depth, 0], stack[depth, 1] = record[what, first + 6], record[what, first + 7]
+                    depth += 1
+            continue
+        for j in range(-1 - what, -1 - what + number):
+            d2 = 0.0
+            for a in range(3):
+                d2 += (sample[j, a] - c[a]) ** 2
+            extra = detour if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE else 0.0
+            if max(0.0, np.sqrt(d2) - radius) ** 2 + extra <= reach2:
+                if count == len(found):
+                    return -1
+                found[count] = j
+                count += 1
+    return count
+
+
+@kernel
+def _nearest_somewhere(distance, n, n_corners, slack, kept):  # type: ignore[no-untyped-def]
+    """Which of n samples no other one beats at all corners of a convex region: `distance` (n, 4) are squared.
+
+    A difference of squared distances is linear in the place, so the corners decide.
+    """
+    best, least = 0, np.inf
+    for j in range(n):
+        largest = 0.0
+        for c in range(n_corners):
+            largest = max(largest, distance[j, c])
+        if largest < least:
+            best, least = j, largest
+    count = 0
+    for j in range(n):
+        for c in range(n_corners):
+            if distance[j, c] <= distance[best, c] + slack:
+                kept[count] = j
+                count += 1
+                break
+    left = 0
+    for a in range(count):
+        beaten = False
+        for b in range(count):
+            everywhere = a != b
+            for c in range(n_corners):
+                everywhere = everywhere and distance[kept[a], c] > distance[kept[b], c] + slack
+            if everywhere:
+                beaten = True
+                break
+        if not beaten:
+            # Entries before `a` are still compared against, so what is left goes behind them.
+            kept[count + left] = kept[a]
+            left += 1
+    for a in range(left):
+        kept[a] = kept[count + a]
+    return left
+
+
+@parallel_kernel
+def find_candidates(  # type: ignore[no-untyped-def]
+    points, to_world, to_object, locator, depth, placed_instance, place, divided, block_face, block_number, count, found
+):
+    """Candidates of the squares of some blocks: `count` (n, 16), -1 for too many, and `found` (n, 16, MOST).
+
+    Block ``block_number[b]``, row by row, of side ``block_face[b]``.
+    """
+    for b in prange(len(block_face)):
+        side = block_face[b] % 2
+        p = block_face[b] // 2
+        i = placed_instance[p]
+        t = p - place[i]
+        count[b, :] = -1
+        slot = locator.slot[2 * i + side]
+        begin, end = locator.slot_begin[slot], locator.slot_begin[slot + 1]
+        px, py, pz = plane_of(points, to_object, i, t)
+        length2 = px * px + py * py + pz * pz
+        if end - begin == 1:
+            count[b, 0] = 1
+            found[b, 0, 0] = begin
+            continue
+        if not length2 > 0.0:
+            continue
+        scale = 1.0 / np.sqrt(length2)
+        if side == 1:
+            scale = -scale
+        n = (np.float32(px * scale), np.float32(py * scale), np.float32(pz * scale))
+        corner, e, f = placed_triangle(points, to_world, i, t)
+        along_u, along_v = divided[block_face[b], 0], divided[block_face[b], 1]
+        blocks_u = (along_u + BLOCK - 1) // BLOCK
+        first_u, first_v = BLOCK * (block_number[b] % blocks_u), BLOCK * (block_number[b] // blocks_u)
+        last_u, last_v = min(first_u + BLOCK, along_u), min(first_v + BLOCK, along_v)
+        whole = along_u == 1 and along_v == 1
+        if first_u / along_u + first_v / along_v > 1.0 + 1e-3:
+            continue
+
+        # The ball around the block, and the samples that can be nearest in it.
+        n_corners = 3 if whole else 4
+        u0, u1, v0, v1 = first_u / along_u, last_u / along_u, first_v / along_v, last_v / along_v
+        if whole:
+            um, vm = 1.0 / 3.0, 1.0 / 3.0
+        else:
+            um, vm = 0.5 * (u0 + u1), 0.5 * (v0 + v1)
+        c = (
+            corner[0] + um * e[0] + vm * f[0],
+            corner[1] + um * e[1] + vm * f[1],
+            corner[2] + um * e[2] + vm * f[2],
+        )
+        radius = 0.0
+        for k in range(n_corners):
+            du = (u1 if k % 2 == 1 else u0) - um
+            dv = (v1 if k // 2 == 1 else v0) - vm
+            x, y, z = du * e[0] + dv * f[0], du * e[1] + dv * f[1], du * e[2] + dv * f[2]
+            radius = max(radius, np.sqrt(x * x + y * y + z * z))
+        radius *= 1.01
+        detour = np.float64(locator.slot_detour[slot])
+        stack = np.empty((2 * depth + 2, 2), np.int64)
+        bound = np.empty(depth + 1, np.float32)
+        j = nearest_sample(
+            locator, i, side, np.float32(c[0]), np.float32(c[1]), np.float32(c[2]), n[0], n[1], n[2], stack, bound
+        )
+        sample = locator.sample
+        d2 = 0.0
+        largest = 0.0  # coordinate, which the rounding of a place is relative to
+        for a in range(3):
+            d2 += (sample[j, a] - c[a]) ** 2
+            largest = max(largest, abs(sample[j, a]) + radius)
+        rounding = largest * 2.0**-22
+        reach2 = (np.sqrt(d2) + radius + rounding) ** 2
+        if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE:
+            reach2 += detour
+        near = np.empty(_SEARCHED, np.int64)
+        number = _within(
+            locator,
+            begin,
+            end,
+            np.int64(locator.slot_record[slot]),
+            c,
+            n,
+            detour,
+            radius + rounding,
+            1.0001 * reach2,
+            stack,
+            near,
+        )
+        if number < 0:
+            continue
+        near = np.sort(near[:number])
+        distance = np.empty((number, 4), np.float64)
+        kept = np.empty(2 * number, np.int64)
+        for b_v in range(first_v, last_v):
+            for b_u in range(first_u, last_u):
+                # A little larger than the square: rounding may put a place on its border into its neighbour.
+                grow = 1e-3
+                lowest_u, highest_u = (b_u - grow) / along_u, (b_u + 1 + grow) / along_u
+                lowest_v, highest_v = (b_v - grow) / along_v, (b_v + 1 + grow) / along_v
+                if lowest_u + lowest_v > 1.0 + grow:
+                    continue
+                far2 = 0.0
+                for k in range(n_corners):
+                    u = highest_u if k % 2 == 1 else lowest_u
+                    v = highest_v if k // 2 == 1 else lowest_v
+                    if whole:  # the corner between the other two, further out
+                        u = 1.0 + 2 * grow if k == 1 else -grow
+                        v = 1.0 + 2 * grow if k == 2 else -grow
+                    x = corner[0] + u * e[0] + v * f[0]
+                    y = corner[1] + u * e[1] + v * f[1]
+                    z = corner[2] + u * e[2] + v * f[2]
+                    for a in range(number):
+                        j = near[a]
+                        d2 = (sample[j, 0] - x) ** 2 + (sample[j, 1] - y) ** 2 + (sample[j, 2] - z) ** 2
+                        if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE:
+                            d2 += detour
+                        distance[a, k] = d2
+                        far2 = max(far2, d2)
+                slack = 1e-5 * far2 + 4.0 * rounding * np.sqrt(far2)
+                left = _nearest_somewhere(distance, number, n_corners, slack, kept)
+                q = (b_v - first_v) * BLOCK + b_u - first_u
+                if left <= MOST:
+                    count[b, q] = left
+                    for a in range(left):
+                        found[b, q, a] = near[kept[a]]
+
+
+@parallel_kernel
+def store_entries(  # type: ignore[no-untyped-def]
+    divided, square_begin, block_face, block_number, count, found, list_begin, stored, face, square, candidates
+):
+    """Entries of the squares of some blocks; `candidates` are theirs, behind `stored` ones of other blocks."""
+    for b in prange(len(block_face)):
+        side = block_face[b]
+        along_u, along_v = divided[side, 0], divided[side, 1]
+        blocks_u = max(1, (along_u + BLOCK - 1) // BLOCK)
+        first_u, first_v = BLOCK * (block_number[b] % blocks_u), BLOCK * (block_number[b] // blocks_u)
+        for q in range(BLOCK * BLOCK):
+            u, v = first_u + q % BLOCK, first_v + q // BLOCK
+            if q > 0 and (u >= along_u or v >= along_v):
+                continue
+            entry = np.int64(WALK)
+            if count[b, q] == 1:
+                entry = np.int64(found[b, q, 0])
+            elif count[b, q] > 1:
+                entry = -1 - (stored + list_begin[b, q])
+                candidates[list_begin[b, q]] = count[b, q]
+                for a in range(count[b, q]):
+                    candidates[list_begin[b, q] + 1 + a] = found[b, q, a]
+            if along_u * along_v > 1:
+                square[square_begin[side] + v * along_u + u] = entry
+            else:
+                face[side, 0] = entry

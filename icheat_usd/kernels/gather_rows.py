@@ -1,0 +1,283 @@
+"""Rows of transport in one pass: gather rays are made, traced, looked up and counted without arrays in between."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+from llvmlite import ir
+from numba import get_num_threads, prange, types
+from numba.extending import intrinsic
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.cell_map import cell_of_hit
+from icheat_usd.kernels.embree import call_1, call_packet
+from icheat_usd.kernels.random import hash_combine, sobol_pair
+from icheat_usd.kernels.samples import basis, cosine_direction, cosine_lobe
+from icheat_usd.kernels.sky import octahedral_bin
+
+BATCH = 4096  # rays that are put in order of direction; their buffers fit the second-level cache
+NOTHING = -1  # key of a ray that ends nowhere: below its surface, or on a degenerate triangle
+DETOUR = -2  # key of a ray that ended on a triangle that does not simply reflect
+_INVALID = np.uint32(0xFFFFFFFF)
+_BINS = 16  # along each axis, of directions in the order of tracing
+
+
+def thread_count() -> int:
+    """Threads that parallel kernels run on."""
+    return int(get_num_threads())
+
+
+@cast(Any, intrinsic)  # as a caller sees it: without the typing context
+def _trailing_zeros(typingctx: Any, word: Any) -> Any:
+    """Place of the lowest bit of a word that is not zero."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), codegen
+
+
+@kernel
+def fill_directions(shading_normal, normal, i, first, last, row_seed, at, x, y, z):  # type: ignore[no-untyped-def]
+    """Cosine directions ``first:last`` of a sequence about point i, to ``x[at:]``; zero where below the surface."""
+    sx, sy, sz = shading_normal[i, 0], shading_normal[i, 1], shading_normal[i, 2]
+    gx, gy, gz = normal[i, 0], normal[i, 1], normal[i, 2]
+    tx, ty, tz, bx, by, bz = basis(sx, sy, sz)
+    out_x, out_y, out_z = x[at : at + last - first], y[at : at + last - first], z[at : at + last - first]
+    zero = np.float32(0.0)
+    for k in range(last - first):
+        u, v = sobol_pair(first + k, row_seed)
+        a, b, c = cosine_lobe(u, v)
+        dx, dy, dz = a * tx + b * bx + c * sx, a * ty + b * by + c * sy, a * tz + b * bz + c * sz
+        above = dx * gx + dy * gy + dz * gz > zero
+        out_x[k] = dx if above else zero
+        out_y[k] = dy if above else zero
+        out_z[k] = dz if above else zero
+
+
+@kernel
+def fill_row(  # type: ignore[no-untyped-def]
+    shading_normal, normal, begin, end, first, n, of_rays, row_seed, at, origin, x, y, z
+):
+    """Rays ``first:first + n`` of a row: point of each, and direction. The row has points ``begin:end``."""
+    points = end - begin
+    k = first
+    while k < first + n:
+        i = k * points // of_rays
+        last = min(first + n, ((i + 1) * of_rays + points - 1) // points)
+        fill_directions(shading_normal, normal, begin + i, k, last, row_seed, at + k - first, x, y, z)
+        for e in range(at + k - first, at + last - first):
+            origin[e] = begin + i
+        k = last
+
+
+@kernel
+def _order_by_direction(n, x, y, z, bin_of, bin_begin, order):  # type: ignore[no-untyped-def]
+    """Rays in order of direction, bin by bin; those without a direction are left out. Returns how many there are."""
+    bin_begin[:] = 0
+    for e in range(n):
+        bin_of[e] = octahedral_bin(x[e], y[e], z[e], _BINS)
+    for e in range(n):
+        if not abs(x[e]) + abs(y[e]) + abs(z[e]) > np.float32(0.0):
+            bin_of[e] = _BINS * _BINS
+        elif (bin_of[e] // _BINS) % 2 == 1:  # there and back, so that successive bins are neighbours
+            bin_of[e] ^= _BINS - 1
+        bin_begin[bin_of[e] + 1] += 1
+    for b in range(_BINS * _BINS):
+        bin_begin[b + 1] += bin_begin[b]
+    for e in range(n):
+        order[bin_begin[bin_of[e]]] = e
+        bin_begin[bin_of[e]] += 1
+    return bin_begin[_BINS * _BINS - 1]
+
+
+@kernel
+def _trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at):  # type: ignore[no-untyped-def]
+    """Nearest hits of a packet, one by one where packets are slower."""
+    if trace.packets:
+        call_packet(trace.function, valid_at, trace.scene, rays_at, trace.arguments)
+        return
+    for k in range(16):
+        if valid[k] == 0:
+            continue
+        for c in range(12):
+            single[c] = rays[c, k]
+        for c in range(17, 21):
+            single_words[c] = _INVALID
+        call_1(trace.function, trace.scene, single_at)
+        for c in range(15, 17):
+            rays[c, k] = single[c]
+        for c in range(17, 21):
+            words[c, k] = single_words[c]
+
+
+@parallel_kernel
+def count_hits(  # type: ignore[no-untyped-def]
+    trace,
+    cells,
+    locator,
+    depth,
+    points,
+    to_world,
+    to_object,
+    triangle_route,
+    position,
+    shading_normal,
+    normal,
+    point_begin,
+    stream,
+    seed,
+    first_ray,
+    n_rays,
+    of_rays,
+    n_cells,
+    sky_bins,
+    counter,
+    mark,
+    count,
+    out_key,
+    out_hits,
+    n_detours,
+    detour,
+):
+    """How many rays of each row end in each cell or, leaving the scene, in each bin of the sky.
+
+    Keys are cells, then ``n_cells +`` bins, and ascend. `detour` (n_rows, n_rays)
+    lists the rays that end on triangles which do not simply reflect.
+    `counter` (n_lanes, n_keys) and `mark` (n_lanes, n_keys / 64) are zero before
+    and after; a lane's rows are worked on by one thread.
+    """
+    n_rows = len(stream)
+    together = max(1, BATCH // n_rays)  # rows whose rays are ordered together
+    n_lanes = counter.shape[0]
+    for lane in prange(n_lanes):
+        x, y, z = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
+        origin, order = np.empty(BATCH, np.int64), np.empty(BATCH, np.int64)
+        bin_of, bin_begin = np.empty(BATCH, np.int32), np.empty(_BINS * _BINS + 2, np.int64)
+        key = np.empty(BATCH, np.int32)
+        stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
+        storage = np.zeros(24 * 16 + 16 + 64, np.float32)
+        shift = np.int64((-storage.ctypes.data % 64) // 4)
+        valid = storage[shift : shift + 16].view(np.int32)
+        rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
+        words = rays.view(np.uint32)
+        single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
+        single_words = single.view(np.uint32)
+        rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
+
+        for block in range(lane, (n_rows + together - 1) // together, n_lanes):
+            row_0, row_1 = block * together, min(n_rows, (block + 1) * together)
+            for r in range(row_0, row_1):
+                n_detours[r] = 0
+            done = 0
+            while done < n_rays:
+                m = min(n_rays - done, BATCH)
+                for r in range(row_0, row_1):
+                    fill_row(
+                        shading_normal,
+                        normal,
+                        point_begin[r],
+                        point_begin[r + 1],
+                        first_ray + done,
+                        m,
+                        of_rays,
+                        hash_combine(seed, stream[r]),
+                        (r - row_0) * m,
+                        origin,
+                        x,
+                        y,
+                        z,
+                    )
+                n = (row_1 - row_0) * m
+                key[:n] = NOTHING
+                n_valid = _order_by_direction(n, x, y, z, bin_of, bin_begin, order)
+                for first in range(0, n_valid, 16):
+                    width = min(16, n_valid - first)
+                    for k in range(16):
+                        e = order[first + min(k, width - 1)]
+                        valid[k] = -1 if k < width else 0
+                        o = origin[e]
+                        for c in range(3):
+                            rays[c, k] = position[o, c]
+                        rays[4, k] = x[e]
+                        rays[5, k] = y[e]
+                        rays[6, k] = z[e]
+                    rays[3, :] = 0.0
+                    rays[7, :] = 0.0
+                    rays[8, :] = np.inf
+                    words[9, :] = _INVALID
+                    words[10, :] = 0
+                    words[11, :] = 0
+                    words[17:21, :] = _INVALID
+                    _trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
+                    for k in range(width):
+                        e = order[first + k]
+                        if words[18, k] == _INVALID:
+                            if sky_bins > 0:
+                                key[e] = n_cells + octahedral_bin(x[e], y[e], z[e], sky_bins)
+                            continue
+                        i = np.int64(words[18, k] if words[19, k] == _INVALID else words[19, k])
+                        t = trace.mesh_begin[trace.instance_mesh[i]] + np.int64(words[17, k])
+                        if triangle_route[t] != 0:
+                            key[e] = DETOUR
+                            continue
+                        key[e] = cell_of_hit(
+                            cells,
+                            locator,
+                            points,
+                            to_world,
+                            to_object,
+                            i,
+                            t,
+                            rays[15, k],
+                            rays[16, k],
+                            x[e],
+                            y[e],
+                            z[e],
+                            stack,
+                            bound,
+                        )
+                done += m
+                for r in range(row_0, row_1):
+                    for k in range(m):
+                        found = key[(r - row_0) * m + k]
+                        if found >= 0:
+                            counter[lane, found] += 1
+                            mark[lane, found >> 6] |= np.uint64(1) << np.uint64(found & 63)
+                        elif found == DETOUR:
+                            detour[r, n_detours[r]] = first_ray + done - m + k
+                            n_detours[r] += 1
+                    if done < n_rays:
+                        continue
+                    total = 0
+                    for w in range(mark.shape[1]):
+                        bits = mark[lane, w]
+                        mark[lane, w] = 0
+                        while bits != np.uint64(0):
+                            found = 64 * w + np.int64(_trailing_zeros(bits))
+                            bits &= bits - np.uint64(1)
+                            out_key[r, total] = found
+                            out_hits[r, total] = counter[lane, found]
+                            counter[lane, found] = 0
+                            total += 1
+                    count[r] = total
+
+
+@parallel_kernel
+def rays_of_rows(  # type: ignore[no-untyped-def]
+    position, shading_normal, normal, point_begin, stream, seed, of_rays, row, ray, origins, directions, counter
+):
+    """Ray ``ray[q]`` of row ``row[q]`` (q,), and a number of its own for random choices on its way."""
+    for q in prange(len(row)):
+        r, k = np.int64(row[q]), np.int64(ray[q])
+        row_seed = hash_combine(seed, stream[r])
+        i = point_begin[r] + k * (point_begin[r + 1] - point_begin[r]) // of_rays
+        u, v = sobol_pair(k, row_seed)
+        x, y, z = cosine_direction(shading_normal[i, 0], shading_normal[i, 1], shading_normal[i, 2], u, v)
+        if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] > np.float32(0.0):
+            x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        directions[q, 0], directions[q, 1], directions[q, 2] = x, y, z
+        for c in range(3):
+            origins[q, c] = position[i, c]
+        counter[q] = np.int32(hash_combine(row_seed, k))
