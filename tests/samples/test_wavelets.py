@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from icheat_usd.samples.tree import ClusterTree, build_tree, split_samples
-from icheat_usd.samples.wavelets import haar_evaluate, haar_forward, haar_inverse
+from icheat_usd.samples.wavelets import haar_evaluate, haar_forward, haar_inverse, haar_of_versions, plan_haar
 
 
 def tree_of(sizes: list[int], seed: int = 0, *, equal: bool = False) -> tuple[ClusterTree, NDArray[np.int64]]:
@@ -95,3 +96,33 @@ def test_the_digest_changes_with_weights_shape_and_names() -> None:
     assert build_tree(shape, np.ones(3), b"x").digest == base
     assert build_tree(shape, np.array([1, 1, 2.0]), b"x").digest != base
     assert build_tree(shape, np.ones(3), b"y").digest != base
+
+
+@pytest.mark.parametrize("sizes", [[1], [2], [1, 1, 1], [5, 1, 17], [1000, 3, 345], [1, 1030, 1, 2100, 5]])
+def test_versions_in_single_precision_are_the_transform(sizes: list[int]) -> None:
+    tree, _ = tree_of(sizes)
+    values = np.random.default_rng(4).lognormal(sigma=2, size=(3, tree.n_leaves, 3)).astype(np.float32)
+    got = haar_of_versions(plan_haar(tree), values)
+    for version in range(3):
+        expected = haar_forward(tree, values[version])
+        np.testing.assert_allclose(got[version, :, :3], expected, rtol=0, atol=1e-6 * np.linalg.norm(expected))
+    assert not got[..., 3].any()
+
+
+def test_versions_have_the_same_bits_for_any_number_of_threads_and_versions() -> None:
+    tree, _ = tree_of([1, 1030, 1, 2100, 5])
+    plan = plan_haar(tree)
+    values = np.random.default_rng(4).normal(size=(3, tree.n_leaves, 3)).astype(np.float32)
+    together = haar_of_versions(plan, values)
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        np.testing.assert_array_equal(haar_of_versions(plan, values), together)
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(haar_of_versions(plan, values[1:2])[0], together[1])
+
+
+def test_versions_of_another_tree_are_refused() -> None:
+    with pytest.raises(ValueError, match="5 leaves"):
+        haar_of_versions(plan_haar(tree_of([5])[0]), np.zeros((1, 4, 3), np.float32))
