@@ -95,6 +95,11 @@ class BoundEdit:
         return len(self.key_weights)
 
     @property
+    def is_prepared(self) -> bool:
+        """True if parameters are filled in from what the selections select."""
+        return self.operation is not None and type(self.operation).prepare is not Operation.prepare
+
+    @property
     def offset_is_paint(self) -> bool:
         return self.operation is None or not self.operation.offset_times_albedo
 

@@ -37,7 +37,7 @@ class BoundMask:
         first = self.first_face[instance]
         painted = first >= 0
         weights = np.zeros(len(instance), np.float32)
-        weights[painted] = _bilinear(self.texels, first[painted] + face[painted], face_uv[painted])
+        weights[painted] = texel_weights(self.texels, first[painted] + face[painted], face_uv[painted])
         return weights
 
 
@@ -90,7 +90,8 @@ def _same_topology(masked: MaskedSurface, surface: Surface) -> bool:
     return digest == surface.topology_digest and masked.n_faces == surface.n_faces
 
 
-def _bilinear(texels: F32, rows: I64, uv: F32) -> F32:
+def texel_weights(texels: F32, rows: I64, uv: F32) -> F32:
+    """Bilinear weights (n,) at places (n, 2) of the faces in some rows of `texels`."""
     resolution = texels.shape[1]
     place = np.clip(uv * np.float32(resolution) - np.float32(0.5), 0, resolution - 1)
     low = np.minimum(place.astype(np.int64), max(resolution - 2, 0))

@@ -42,3 +42,20 @@ def texel_positions(face_begin, points, face_uv, resolution, out):  # type: igno
                             out[f, y, x, axis] = np.float32(
                                 (1.0 - b1 - b2) * points[k, 0, axis] + b1 * points[k, 1, axis] + b2 * points[k, 2, axis]
                             )
+
+
+@parallel_kernel
+def touched_places(places, row, uv, changed, out):  # type: ignore[no-untyped-def]
+    """Whether one of the four texels around each place has changed; as `edits.masks.texel_weights` picks them."""
+    resolution = changed.shape[1]
+    for k in prange(len(places)):
+        place = places[k]
+        low = np.empty(2, np.int64)
+        for axis in range(2):
+            x = uv[place, axis] * np.float32(resolution) - np.float32(0.5)
+            x = min(max(x, np.float32(0)), np.float32(resolution - 1))
+            low[axis] = min(np.int64(x), max(resolution - 2, 0))
+        x0, y0 = low[0], low[1]
+        x1, y1 = min(x0 + 1, resolution - 1), min(y0 + 1, resolution - 1)
+        face = row[place]
+        out[k] = changed[face, y0, x0] or changed[face, y0, x1] or changed[face, y1, x0] or changed[face, y1, x1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -50,6 +51,7 @@ class CompiledStack:
     slot_begin: I64  #: (n_rows + 1,) those of each row: one, or one for each cell of its support
     support: Bool  #: (n_rows, n_gather) cells on surfaces that the casters may lie on, painted or not
     together: Bool  #: (n_signatures, n_rows) rows that occur together at some cell
+    _entries: dict[int, I64] = dataclasses.field(default_factory=dict)
 
     @property
     def n_rows(self) -> int:
@@ -68,9 +70,18 @@ class CompiledStack:
             return member
         return int(np.flatnonzero(self.row_table[:, 4] == member)[0])
 
-    def rows_before(self, edit: int) -> int:
-        """Rows of the edits before one."""
-        return int(np.searchsorted(self.row_table[:, 0], edit))
+    def slots_of(self, row: int) -> F64:
+        """Numbers of a row, to be read or written."""
+        return self.slots[self.slot_begin[row] : self.slot_begin[row + 1]]
+
+    def set_weights(self, row: int, cells: I64, weights: F32) -> None:
+        """Paint some cells of the row's support anew."""
+        if row not in self._entries:
+            self._entries[row] = np.flatnonzero(self.entry_row == row)
+        there = self.support[row]
+        rank = np.cumsum(there) - 1
+        inside = there[cells]
+        self.entry_weight[self._entries[row][rank[cells[inside]]]] = weights[inside]
 
 
 def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) -> CompiledStack:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from icheat_usd.edits.bound import Ends, sent_anew
-from icheat_usd.edits.model import EditStack
-from icheat_usd.errors import SampleSetMismatch
+from icheat_usd.edits.history import History
+from icheat_usd.edits.model import EditStack, SurfaceMask
+from icheat_usd.errors import EditError, SampleSetMismatch
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.groups import SampleGroups, TermTable
-from icheat_usd.relight.live_stack import LiveStack
+from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.relighter import RelitView
 from icheat_usd.relight.term_tables import TermTables
@@ -79,6 +81,7 @@ class LiveRelighter:
         self._lights_seen: Any = None
         self._light_stale = True
         self._stack = LiveStack(snapshot, view, gather)
+        self._history: History | None = None
         self.set_transport(transport)
 
     # Commands ---------------------------------------------------------------------------------------------------------
@@ -88,7 +91,7 @@ class LiveRelighter:
         for lobe in transport.lobes:
             if len(lobe.tint) != self.view.n:
                 raise SampleSetMismatch(
-                    f"the transport has {len(lobe.tint)} view samples, and the view {self.view.n}; build it for this view"
+                    f"the transport has {len(lobe.tint)} view samples, the view {self.view.n}; build it for this view"
                 )
         self.transport = transport
         self._products = Products(transport, self.gather.tree)
@@ -113,6 +116,83 @@ class LiveRelighter:
             There is no such edit, or the amount is not finite.
         """
         self._changed(self._stack.set_amount(edit_path, amount))
+
+    def dab(self, edit_path: str, side: str, mask: SurfaceMask, key: int = 0) -> None:
+        """Paint: show another mask of one edit, on the same surfaces; only what its texels touch is found anew.
+
+        Parameters
+        ----------
+        side : "receivers" or "casters"
+        mask
+            As it is after the dab.
+        key : int
+            Which of the edit's painted keys.
+
+        Raises
+        ------
+        EditError
+            There is no such edit, side or key.
+        """
+        names = {"receivers": RECEIVERS, "casters": CASTERS}
+        edit = self._stack.edit(edit_path)
+        if side not in names:
+            raise EditError(f"{edit_path}: '{side}' cannot be painted; expected one of {', '.join(names)}")
+        if not 0 <= key < len(edit.keys) or edit.keys[key].payload is None:
+            raise EditError(f"{edit_path}: there is no painted key {key}; the edit has {len(edit.keys)}")
+        payload = edit.keys[key].payload
+        assert payload is not None
+        payload = replace(payload, receiver_mask=mask) if side == "receivers" else replace(payload, caster_mask=mask)
+        keys = (*edit.keys[:key], replace(edit.keys[key], payload=payload, digest=""), *edit.keys[key + 1 :])
+        self._changed(self._stack.set_edit(replace(edit, keys=keys)))
+
+    def mute(self, edit_path: str, muted: bool = True) -> None:
+        """Leave one edit out, or show it again."""
+        self._changed(self._stack.set_edit(replace(self._stack.edit(edit_path), enabled=not muted)))
+
+    def reorder(self, edit_paths: Sequence[str]) -> None:
+        """Apply the edits in another order, weakest first.
+
+        Raises
+        ------
+        EditError
+            Not every edit of the stack is named once.
+        """
+        edits = {edit.path: edit for edit in self.stack.edits}
+        if sorted(edit_paths) != sorted(edits):
+            raise EditError(f"an order of the stack names each of {', '.join(sorted(edits))} once")
+        self.set_stack(replace(self.stack, edits=tuple(edits[path] for path in edit_paths), digest=""))
+
+    def commit(self) -> None:
+        """Make what is shown a step that can be undone; the first commit is where undoing ends."""
+        self._history = History((self.stack,)) if self._history is None else self._history.committed(self.stack)
+
+    def undo(self) -> None:
+        """Go back to the last commit that differs from what is shown.
+
+        Raises
+        ------
+        EditError
+            There is none.
+        """
+        self.commit()
+        assert self._history is not None
+        self._go_to(self._history.undone())
+
+    def redo(self) -> None:
+        """Undo the last undo.
+
+        Raises
+        ------
+        EditError
+            Nothing was undone since the last change.
+        """
+        self.commit()
+        assert self._history is not None
+        self._go_to(self._history.redone())
+
+    def _go_to(self, history: History) -> None:
+        self.set_stack(history.stack)
+        self._history = history
 
     @property
     def stack(self) -> EditStack:
@@ -152,13 +232,17 @@ class LiveRelighter:
     def _light_paths(self) -> tuple[str, ...]:
         return tuple(getattr(self.lights, "paths", self._snapshot.light_paths))
 
-    def _changed(self, rows: list[int] | None) -> None:
-        if rows is None:
+    def _changed(self, change: Change | None) -> None:
+        if change is None:
             self._regroup()
             return
-        self._versions.stack_changed(self._stack.compiled, rows)
-        self._changed_rows.update(rows)
-        if self._stack.active_rows != self._active_rows:
+        self._versions.stack_changed(self._stack.compiled, change.rows)
+        self._changed_rows.update(change.rows)
+        if len(change.samples):
+            self._changed_samples.append(change.samples)
+            self._samples_of.clear()
+            self._place(change.samples)
+        elif self._stack.active_rows != self._active_rows:
             self._find_touched()
 
     def _regroup(self) -> None:
@@ -168,6 +252,7 @@ class LiveRelighter:
         self._versions = Versions(stack.compiled, self._products, self.gather.area)
         self._terms = TermTables(stack.compiled, self._groups, self._versions)
         self._changed_rows: set[int] = set()
+        self._changed_samples: list[I64] = []
         self._samples_of: dict[frozenset[int], tuple[I64, I64]] = {}
         self._light_stale = True
         self._place(np.flatnonzero((stack.receiver_masks != 0).any(axis=0)))
@@ -216,15 +301,26 @@ class LiveRelighter:
         """Samples that some rows touch, and their pixels."""
         if rows not in self._samples_of:
             samples = np.flatnonzero(self._touched_by(rows))
-            pixels = self.view.pixel[samples].astype(np.int64)
-            self._samples_of[rows] = samples, pixels[np.diff(pixels, prepend=-1) != 0]
+            self._samples_of[rows] = samples, self._pixels_of(samples)
         return self._samples_of[rows]
+
+    def _changed_places(self) -> tuple[I64, I64]:
+        """Samples to find the light of anew, and their pixels."""
+        samples, pixels = self._samples_of_rows(frozenset(self._changed_rows))
+        if self._changed_samples:
+            samples = np.unique(np.concatenate([samples, *self._changed_samples]))
+            pixels = self._pixels_of(samples)
+        return samples, pixels
+
+    def _pixels_of(self, samples: I64) -> I64:
+        pixels = self.view.pixel[samples].astype(np.int64)
+        return np.asarray(pixels[np.diff(pixels, prepend=-1) != 0])
 
     # Evaluation -------------------------------------------------------------------------------------------------------
 
     def _update(self) -> None:
         self._look_at_lights()
-        if not self._light_stale and not self._changed_rows:
+        if not self._light_stale and not self._changed_rows and not self._changed_samples:
             return
         if self._light_stale:
             b = np.ascontiguousarray(self.lights.total(), np.float32)
@@ -235,11 +331,11 @@ class LiveRelighter:
             self._versions.light_changed(self._by_group)
             samples, pixels = np.flatnonzero(self._touched), self._all_pixels
         else:
-            samples, pixels = self._samples_of_rows(frozenset(self._changed_rows))
+            samples, pixels = self._changed_places()
         self._versions.update()
         self._edit(samples)
         self._light_stale = False
-        self._changed_rows = set()
+        self._changed_rows, self._changed_samples = set(), []
         kernels.develop_pixels(
             pixels, self._sample_begin, self._still, self._throughput, self._direct, self._edited, self._film
         )

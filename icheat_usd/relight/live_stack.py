@@ -2,18 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.edits.binding import bind, rebind
 from icheat_usd.edits.bound import BoundEdit
 from icheat_usd.edits.field import EditField
-from icheat_usd.edits.model import EMPTY_STACK, Edit, EditStack, KeyedPayload
+from icheat_usd.edits.model import EMPTY_STACK, Edit, EditStack, KeyedPayload, SurfaceMask, Value
+from icheat_usd.edits.selection import BoundSelection
 from icheat_usd.errors import EditError
 from icheat_usd.relight.compiled import CompiledStack, Way, compile_stack, numbers_of
+from icheat_usd.relight.painted import PaintedPoints
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
+
+#: Sides of an edit: fields of a payload.
+RECEIVERS, CASTERS = "receiver_mask", "caster_mask"
+
+
+class Change(NamedTuple):
+    """What a command has changed in a stack of the same structure."""
+
+    rows: list[int]  #: whose casters send otherwise
+    samples: I64  #: ascending, whose receiver masks are others
+
+
+class _Exchange(NamedTuple):
+    """An edit in the place of another one."""
+
+    edit: int
+    bound: BoundEdit
+    numbers: list[tuple[int, F64]]  #: row and slots
+    receivers: list[tuple[int, I64, F32]]  #: row, view samples and weights
+    casters: list[tuple[int, I64, F32]]  #: row, gather samples and weights
+    sends_otherwise: bool
 
 
 class LiveStack:
@@ -42,32 +67,42 @@ class LiveStack:
             row for edit, bound in enumerate(self.field.edits) if bound.edit.amount != 0 for row in self._rows(edit)
         ]
 
-    def set_stack(self, stack: EditStack, light_paths: tuple[str, ...]) -> list[int] | None:
-        """Take another stack; rows that act differently now, or None if the structure is another one."""
+    def set_stack(self, stack: EditStack, light_paths: tuple[str, ...]) -> Change | None:
+        """Take another stack; what changed, or None if the structure is another one."""
         changed = None if light_paths != self.light_paths else self._changed_edits(stack)
         if changed is None:
             self._show(stack, self._bind(stack, light_paths), light_paths)
             return None
-        bound = {edit: self._rebound(self.field.edits[edit], now) for edit, now in changed}
-        rows = self._exchange(bound)
+        change = self._exchange(changed)
+        if change is None:
+            self._show(stack, self._bind(stack, light_paths), light_paths)
         self.stack = stack
-        return rows if rows is not None else self.set_stack_anew()
+        return change
 
-    def set_stack_anew(self) -> None:
-        """Bind and compile the stack again."""
-        self._show(self.stack, self._bind(self.stack, self.light_paths), self.light_paths)
-
-    def set_amount(self, edit_path: str, amount: float) -> list[int] | None:
+    def set_amount(self, edit_path: str, amount: float) -> Change | None:
         """Change one amount; as `set_stack`."""
         if not np.isfinite(amount):
             raise EditError(f"{edit_path}: the amount is {amount!r}, expected a finite number")
-        edits = self.stack.edits
-        found = [k for k, edit in enumerate(edits) if edit.path == edit_path]
-        if not found:
-            raise EditError(f"there is no edit {edit_path} in the stack; it has {', '.join(e.path for e in edits)}")
-        changed = replace(edits[found[0]], amount=float(amount))
-        stack = replace(self.stack, edits=(*edits[: found[0]], changed, *edits[found[0] + 1 :]))
-        return self.set_stack(stack, self.light_paths)
+        return self.set_edit(replace(self.edit(edit_path), amount=float(amount)))
+
+    def edit(self, edit_path: str) -> Edit:
+        """The edit at a path.
+
+        Raises
+        ------
+        EditError
+            There is none.
+        """
+        for edit in self.stack.edits:
+            if edit.path == edit_path:
+                return edit
+        listed = ", ".join(edit.path for edit in self.stack.edits) or "no edits"
+        raise EditError(f"there is no edit {edit_path} in the stack {self.stack.path}, which has {listed}")
+
+    def set_edit(self, now: Edit) -> Change | None:
+        """Put an edit in the place of the one of its path; as `set_stack`."""
+        edits = tuple(now if edit.path == now.path else edit for edit in self.stack.edits)
+        return self.set_stack(replace(self.stack, edits=edits, digest=""), self.light_paths)
 
     # Binding ----------------------------------------------------------------------------------------------------------
 
@@ -85,12 +120,6 @@ class LiveStack:
         now = {edit.path: _weighed(stack, edit) for edit in stack.edits}
         return replace(field, edits=tuple(replace(bound, edit=now[bound.edit.path]) for bound in field.edits))
 
-    def _rebound(self, bound: BoundEdit, now: Edit) -> BoundEdit:
-        before = bound.edit
-        if before.parameters == now.parameters and before.keys == now.keys:
-            return replace(bound, edit=now)
-        return rebind(bound, now, self._snapshot)
-
     def _show(self, stack: EditStack, field: EditField, light_paths: tuple[str, ...]) -> None:
         receivers = field.receivers(self._view.points).masks
         casters = field.casters(self._gather.points).masks
@@ -98,6 +127,7 @@ class LiveStack:
         self.stack, self.field, self.light_paths, self.compiled = stack, field, light_paths, compiled
         self.receiver_masks = np.ascontiguousarray(receivers)
         self.caster_masks = np.ascontiguousarray(casters)
+        self._painted: dict[tuple[int, str], PaintedPoints] = {}
 
     def _changed_edits(self, stack: EditStack) -> list[tuple[int, Edit]] | None:
         """Edits of the field that are set differently in `stack`; None if its structure is another one."""
@@ -111,32 +141,77 @@ class LiveStack:
             if not _same_structure(before, now):
                 return None
             if now.path in place:
+                if any(selection.findings for selection in _selections(self.field.edits[place[now.path]])):
+                    return None
                 changed.append((place[now.path], _weighed(stack, now)))
             elif _is_active(stack, now) or before.keys != now.keys:
                 return None
         return changed
 
-    def _exchange(self, bound: dict[int, BoundEdit]) -> list[int] | None:
-        """Put edits in the place of others of the same structure: rows, or None if their numbers do not fit."""
-        compiled, numbers = self.compiled, {}
-        for edit, now in bound.items():
-            for key, row in enumerate(self._rows(edit)):
-                if compiled.way[row] == Way.VERSION:
-                    numbers[row] = numbers_of(now, key, self._gather, np.flatnonzero(compiled.support[row]))
-                    if len(numbers[row]) != compiled.slot_begin[row + 1] - compiled.slot_begin[row]:
-                        return None
-        for row, values in numbers.items():
-            compiled.slots[compiled.slot_begin[row] : compiled.slot_begin[row + 1]] = values
-        edits = list(self.field.edits)
-        rows = []
-        for edit, now in bound.items():
-            edits[edit] = now
-            for key, row in enumerate(self._rows(edit)):
-                compiled.row_amount[row] = now.edit.amount * now.key_weights[key]
-                rows.append(row)
+    def _exchange(self, changed: list[tuple[int, Edit]]) -> Change | None:
+        """Put edits in the place of others of the same structure; None if their numbers do not fit after all."""
+        exchanges = [self._exchanged(edit, now) for edit, now in changed]
+        compiled = self.compiled
+        if any(len(new) != len(compiled.slots_of(row)) for found in exchanges for row, new in found.numbers):
+            return None
+        edits, samples = list(self.field.edits), [np.empty(0, np.int64)]
+        for found in exchanges:
+            edits[found.edit] = found.bound
+            for row, new in found.numbers:
+                compiled.slots_of(row)[:] = new
+            for row, points, weights in found.receivers:
+                self.receiver_masks[row, points] = weights
+                samples.append(points)
+            for row, points, weights in found.casters:
+                self.caster_masks[row, points] = weights
+                compiled.set_weights(row, points, weights)
+            for key, row in enumerate(self._rows(found.edit)):
+                compiled.row_amount[row] = found.bound.edit.amount * found.bound.key_weights[key]
         self.field = replace(self.field, edits=tuple(edits))
         self.compiled = replace(compiled, field=self.field)
-        return rows
+        rows = [row for found in exchanges if found.sends_otherwise for row in self._rows(found.edit)]
+        return Change(rows, np.unique(np.concatenate(samples)))
+
+    def _exchanged(self, edit: int, now: Edit) -> _Exchange:
+        before = self.field.edits[edit]
+        bound, sides = replace(before, edit=now), []
+        for side, points in ((RECEIVERS, self._view.points), (CASTERS, self._gather.points)):
+            sides.append([])
+            for key, row in enumerate(self._rows(edit)):
+                mask = _mask(now, key, side)
+                if mask is not None and mask is not _mask(before.edit, key, side):
+                    bound, found, weights = self._repainted(bound, key, side, row, mask, points)
+                    sides[-1].append((row, found, weights))
+        recipe_stays = now.parameters == before.edit.parameters and _recipes(now) == _recipes(before.edit)
+        if not recipe_stays or (any(sides) and bound.is_prepared):
+            bound = rebind(bound, now, self._snapshot)
+        weights_stay = _key_weights(now) == before.key_weights and now.amount == before.edit.amount
+        bound = replace(bound, key_weights=_key_weights(now))
+        numbers = []
+        if bound.parameters is not before.parameters:
+            for key, row in enumerate(self._rows(edit)):
+                if self.compiled.way[row] == Way.VERSION:
+                    cells = np.flatnonzero(self.compiled.support[row])
+                    numbers.append((row, numbers_of(bound, key, self._gather, cells)))
+        sends_otherwise = bound.parameters is not before.parameters or not weights_stay or bool(sides[1])
+        return _Exchange(edit, bound, numbers, sides[0], sides[1], sends_otherwise)
+
+    def _repainted(
+        self, bound: BoundEdit, key: int, side: str, row: int, mask: SurfaceMask, points: SurfacePoints
+    ) -> tuple[BoundEdit, I64, F32]:
+        """The edit with another mask on the same surfaces; points whose weight may have changed and their weights."""
+        selections = list(bound.receivers if side == RECEIVERS else bound.casters)
+        selection = selections[key]
+        assert selection.mask is not None
+        if (row, side) not in self._painted:
+            self._painted[row, side] = PaintedPoints(selection, points)
+        painted = self._painted[row, side]
+        places = painted.touched(mask.texels != selection.mask.texels)
+        found, weights = painted.weights(places, mask.texels)
+        selections[key] = replace(selection, mask=replace(selection.mask, texels=mask.texels))
+        if side == RECEIVERS:
+            return replace(bound, receivers=tuple(selections)), found, weights
+        return replace(bound, casters=tuple(selections)), found, weights
 
     def _rows(self, edit: int) -> range:
         rows = self.field.rows_of(edit)
@@ -165,7 +240,7 @@ def _can_be_bound(edit: Edit, snapshot: SceneSnapshot) -> bool:
 
 
 def _same_structure(a: Edit, b: Edit) -> bool:
-    """Whether two edits differ in amount, parameters and weights of keys alone."""
+    """Whether two edits differ in amount, parameters, weights of keys and texels of masks alone."""
     return (
         (a.path, a.operation, a.blend, a.occluders, a.lights) == (b.path, b.operation, b.blend, b.occluders, b.lights)
         and a.receivers == b.receivers
@@ -180,5 +255,35 @@ def _same_payload(a: KeyedPayload, b: KeyedPayload) -> bool:
         return True
     if a.payload is None or b.payload is None:
         return False
-    names = ("receiver_mask", "caster_mask", "rows", "scale_delta", "emission", "offset")
-    return all(getattr(a.payload, name) is getattr(b.payload, name) for name in names)
+    names = ("rows", "scale_delta", "emission", "offset")
+    same = all(getattr(a.payload, name) is getattr(b.payload, name) for name in names)
+    return same and all(
+        _same_surfaces(getattr(a.payload, side), getattr(b.payload, side)) for side in (RECEIVERS, CASTERS)
+    )
+
+
+def _same_surfaces(a: SurfaceMask | None, b: SurfaceMask | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    same = a.surfaces is b.surfaces or a.surfaces == b.surfaces
+    return a is b or (same and a.texels.shape == b.texels.shape and a.rest is b.rest)
+
+
+def _selections(bound: BoundEdit) -> tuple[BoundSelection, ...]:
+    return (*bound.receivers, *bound.casters)
+
+
+def _mask(edit: Edit, key: int, side: str) -> SurfaceMask | None:
+    if not edit.keys:
+        return None
+    payload = [keyed.payload for keyed in edit.keys if keyed.payload is not None][key]
+    found: SurfaceMask | None = getattr(payload, side)
+    return found
+
+
+def _recipes(edit: Edit) -> list[Mapping[str, Value]]:
+    return [keyed.payload.parameters for keyed in edit.keys if keyed.payload is not None]
+
+
+def _key_weights(edit: Edit) -> tuple[float, ...]:
+    return tuple(keyed.weight for keyed in edit.keys if keyed.payload is not None) if edit.keys else (1.0,)

@@ -105,6 +105,8 @@ class Versions:
         self._arrange()
         version, tile = np.nonzero((needed != 0) & (self.pair_of < 0))
         first = len(self._pair_tile)
+        if not len(version):
+            return
         self.pair_of[version, tile] = first + np.arange(len(version), dtype=np.int32)
         self._pair_tile = np.concatenate([self._pair_tile, tile.astype(np.int32)])
         self._pair_version = np.concatenate([self._pair_version, version.astype(np.int32)])

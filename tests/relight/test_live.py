@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from icheat_usd.edits.model import Edit, EditStack
+from icheat_usd.edits.model import Edit, EditStack, SurfaceMask
+from icheat_usd.errors import EditError
 from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.scene import F32
 from icheat_usd.transport import sum_lights
 from tests.pipeline import Pipeline
-from tests.relight.test_operations import PARAMETERS, pipeline, stacks
+from tests.relight.test_operations import MIXED, PARAMETERS, edit, pipeline, soft, stacks
 
 
 class StillLights:
@@ -68,3 +71,73 @@ def assert_equals_the_exact_relighter(kind: str, edits: tuple[Edit, ...]) -> Non
 @pytest.mark.parametrize("operation", PARAMETERS)
 def test_operations_equal_the_exact_relighter(operation, stack):
     assert_equals_the_exact_relighter("full", stacks(operation)[stack])
+
+
+@pytest.mark.parametrize("operation", ["falloff", "gamma", "unshadow", "paint", "hsv"])
+def test_operations_on_interpolated_rows_equal_the_exact_relighter(operation):
+    assert_equals_the_exact_relighter("coarse", stacks(operation)["between hard edits"])
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_levels_that_meet_equal_the_exact_relighter(name):
+    edits = tuple(
+        soft(f"e{k}", operation, "/floor", "/red", 3 * k) if k == 0 else edit(f"e{k}", operation, amount=0.8)
+        for k, operation in enumerate(MIXED[name])
+    )
+    assert_equals_the_exact_relighter("full", edits)
+
+
+def fresh(of: Pipeline, stack: EditStack, gains: F32) -> LiveRelighter:
+    lights = StillLights(of)
+    lights.gains[:] = gains
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, of.transport, lights, held_back=of.relighter.held_back)
+    shown.set_stack(stack)
+    return shown
+
+
+def repainted(mask: SurfaceMask, rng: np.random.Generator) -> SurfaceMask:
+    """The mask after a dab on a few of its texels; weights reach 0 and 1."""
+    texels = mask.texels.copy()
+    face = rng.integers(len(texels))
+    y, x = rng.integers(0, texels.shape[1] - 1, 2)
+    texels[face, y : y + 2, x : x + 2] = rng.choice([0.0, 1.0, rng.uniform()])
+    return replace(mask, texels=texels)
+
+
+@pytest.mark.parametrize(
+    "operations", [("scale", "hsv", "scale"), ("gamma", "paint", "falloff"), ("emit", "curve", "receive")]
+)
+def test_the_same_state_has_the_same_bits_whatever_led_to_it(operations):
+    of = pipeline("full")
+    edits = tuple(soft(f"e{k}", name, "/floor", "/red", 3 * k) for k, name in enumerate(operations))
+    stack = EditStack("/stack", (*edits, edit("hard", "scale", amount=0.5)))
+    shown = fresh(of, stack, np.ones((2, 3), np.float32))
+    shown.commit()
+    rng = np.random.default_rng(len(operations[0]))
+    for step in range(24):
+        path = f"/e{rng.integers(3)}"
+        command = rng.choice(["amount", "mute", "reorder", "dab", "undo", "redo", "gain", "commit", "frame"])
+        if command == "amount":
+            shown.set_amount(path, float(rng.choice([0.0, 0.3, 1.2])))
+        elif command == "mute":
+            shown.mute(path, bool(rng.integers(2)))
+        elif command == "reorder":
+            shown.reorder([shown.stack.edits[k].path for k in rng.permutation(4)])
+        elif command == "dab":
+            side = str(rng.choice(["receivers", "casters"]))
+            payload = next(e for e in shown.stack.edits if e.path == path).keys[1].payload
+            mask = payload.receiver_mask if side == "receivers" else payload.caster_mask
+            shown.dab(path, side, repainted(mask, rng), key=1)
+        elif command in ("undo", "redo"):
+            with contextlib.suppress(EditError):
+                getattr(shown, command)()
+        elif command == "gain":
+            shown.lights.set_gain(int(rng.integers(2)), rng.uniform(0, 2, 3))
+        elif command == "commit":
+            shown.commit()
+        if step % 3 == 0:
+            shown.frame()
+    again = fresh(of, shown.stack, shown.lights.gains)
+    np.testing.assert_array_equal(shown.frame(), again.frame())
+    for found, expected in zip(shown.relit(), again.relit(), strict=True):
+        np.testing.assert_array_equal(found, expected)
