@@ -192,7 +192,7 @@ def error_edits(parts: Parts) -> dict[str, Edit]:
     """Edits whose effect is compared."""
     edits = edits_of_objects_and_brushes(parts)
     receivers, casters = (paths[:n] for paths, n in zip(ranked_paths(parts), (4, 8), strict=True))
-    edits["gamma"] = one_edit("gamma", "gamma", {"gamma": 0.7}, receivers, casters)
+    edits["gamma"] = one_edit("gamma", "gamma", {"exponent": 0.7}, receivers, casters)
     return edits
 
 

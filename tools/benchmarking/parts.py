@@ -84,6 +84,11 @@ class Parts:
         source = getattr(self.packed, "source", None)
         return source if isinstance(source, Transport) else self._shot.transport
 
+    @property
+    def exact(self) -> Transport:
+        """Rows before packing, whatever `packed` holds."""
+        return self._shot.transport
+
     @cached_property
     def packed(self) -> Any:
         """What frames multiply with."""

@@ -26,6 +26,7 @@ SUITES = {
     "errors": "error_suite",
     "growth": "growth",
     "build": "build",
+    "bits": "bits",
     "soak": "soak",
 }
 _QUICK_STAGE = "sample_stages/cornell_box/shot.usda"
@@ -73,7 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
         for case in suite.cases(stages, arguments.quick):
             case = {"name": short_name(case["stage"]), "minutes": arguments.minutes, **case}
             print(f"{name}: {_described(case)}", flush=True)
-            results.append(_in_a_process(name, case, effort, arguments.quick, folder))
+            task = {"suite": name, "case": case, "effort": effort, "quick": arguments.quick}
+            results.append(_run_case(task | {"folder": str(folder / "images")}))
             failed += "error" in results[-1]
             _save(report | {"suites": report["suites"] | {name: results}}, folder)
         report["suites"][name] = results
@@ -100,20 +102,23 @@ def _described(case: dict[str, Any]) -> str:
     return ", ".join([case["name"], *extras])
 
 
-def _in_a_process(
-    suite: str, case: dict[str, Any], effort: dict[str, Any], quick: bool, folder: Path
-) -> dict[str, Any]:
-    """So that no case finds what another left in memory, and peaks do not add up."""
-    task = {"suite": suite, "case": case, "effort": effort, "quick": quick, "folder": str(folder / "images")}
-    environment = os.environ | {"ICHEAT_CACHE_SIZE": "0"}  # nothing is found on disk that another run has left
+def _run_case(task: dict[str, Any]) -> dict[str, Any]:
+    """In a process of its own, so that none finds what another left in memory, and peaks do not add up.
+
+    A quick run has no figures worth that, and saves the start of each.
+    """
+    os.environ["ICHEAT_CACHE_SIZE"] = "0"  # nothing is found on disk that another run has left
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
-        task["json"] = str(Path(scratch) / "result.json")
-        worker = [sys.executable, str(ROOT / "tools" / "benchmark"), "relight", "--worker", json.dumps(task)]
-        status = subprocess.run(worker, env=environment, check=False).returncode
-        written = Path(task["json"])
+        written = Path(scratch) / "result.json"
+        task = task | {"json": str(written)}
+        if task["quick"]:
+            status = _work(task)
+        else:
+            worker = [sys.executable, str(ROOT / "tools" / "benchmark"), "relight", "--worker", json.dumps(task)]
+            status = subprocess.run(worker, check=False).returncode
         found = json.loads(written.read_text()) if written.exists() else {"error": f"the process ended with {status}"}
-    return {"case": case, "wall_seconds": time.perf_counter() - start, **found}
+    return {"case": task["case"], "wall_seconds": time.perf_counter() - start, **found}
 
 
 def _work(task: dict[str, Any]) -> int:

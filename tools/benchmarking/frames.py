@@ -1,0 +1,230 @@
+"""Suite `frames`: frames per second of each kind of change, every frame computed anew."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.edits.model import EditStack
+from icheat_usd.scene import LightKind
+from tools.benchmarking.made_up_edits import many_edits, one_edit, ranked_paths
+from tools.benchmarking.meter import Threads, repeat, summary
+from tools.benchmarking.parts import AREA_KINDS, Effort, Parts, with_movable_lights
+from tools.benchmarking.strokes import Stroke
+
+#: Frames per second that are hoped for on two cores, by size and change.
+GOALS = {
+    (640, 480): {
+        "light colour": 500,
+        "amount": 500,
+        "light move": 60,
+        "dome rotation": 30,
+        "dab": 60,
+        "64 edits: amount": 100,
+        "64 edits: light move": 20,
+    },
+    (1920, 1080): {"light colour": 100, "amount": 100},
+}
+_LARGE = {"width": 1920, "height": 1080}
+
+
+def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
+    """Every stage at the size that was asked for, and large."""
+    found: list[dict[str, Any]] = [{"stage": stage} for stage in stages]
+    return found if quick else found + [{"stage": stage, **_LARGE} for stage in stages]
+
+
+@dataclass
+class Scene:
+    """A relit stage and what is changed in it."""
+
+    parts: Parts
+    area_light: int
+    dome: int
+    stack: EditStack  #: one edit
+    many: EditStack
+
+
+def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
+    """Times of every change with two threads and with one, and whether both gave the same bits."""
+    large = "width" in case
+    if large:
+        effort = replace(effort, width=case["width"], height=case["height"])
+    parts, added = with_movable_lights(Parts(case["stage"], effort))
+    parts.refine_lights()
+    scene = make_scene(parts)
+    changes = _changes(scene)
+    if large:
+        changes = {name: changes[name] for name in ("light colour", "amount")}
+    found: dict[str, Any] = {
+        "width": effort.width,
+        "height": effort.height,
+        "view_samples": parts.view.n,
+        "gather_samples": parts.gather.n,
+        "records": len(parts.packed.row_view),
+        "transport_bytes": getattr(parts.packed, "n_bytes", None),
+        "lights": list(parts.snapshot.light_paths),
+        "added_lights": added,
+        "edits": {"one": 1, "many": len(scene.many.edits)},
+        "changes": {},
+    }
+    limits = {"least": 2, "most": 2} if quick else {"least": 11, "most": 201}
+    for name, begin in changes.items():
+        times = {}
+        for threads in (2, 1):
+            step = begin()
+            with Threads(threads):
+                samples = repeat(step, seconds=2.0, **limits)
+            times[str(threads)] = summary(samples) | {"samples": samples}
+        found["changes"][name] = {
+            "threads": times,
+            "fps": 1 / times["2"]["median"],
+            "same_bits": _same_bits(begin),
+        }
+        two, one = (1 / times[str(n)]["median"] for n in (2, 1))
+        print(f"  {name:<24} {two:8.1f} frames/s, one thread {one:8.1f}", flush=True)
+    return found
+
+
+def make_scene(parts: Parts) -> Scene:
+    """The changes need an area light, a dome and edits."""
+    kinds = parts.snapshot.lights.kind
+    area = int(np.flatnonzero(np.isin(kinds, [int(kind) for kind in AREA_KINDS]))[0])
+    dome = int(np.flatnonzero(kinds == int(LightKind.DOME))[0])
+    seen, sending = ranked_paths(parts)
+    edit = one_edit("edit", "scale", {"gain": 1.5, "color": (1.2, 1.0, 0.8)}, seen[:2], sending[:3])
+    return Scene(parts, area, dome, EditStack("/Edits", (edit,)), many_edits(parts))
+
+
+def _changes(scene: Scene) -> dict[str, Callable[[], Callable[[int], Any]]]:
+    """By name: prepares, and returns what makes frame i."""
+    live, lights = scene.parts.live, scene.parts.lights
+    image = np.empty((scene.parts.view.height, scene.parts.view.width, 3), np.float32)
+    start = lights_as_they_are(scene.parts)
+
+    def prepared(stack: EditStack, change: Callable[[int], None]) -> Callable[[], Callable[[int], Any]]:
+        def begin() -> Callable[[int], Any]:
+            restore(scene.parts, start)
+            live.set_stack(stack)
+            live.frame(image)
+
+            def step(i: int) -> Any:
+                change(i)
+                return live.frame(image)
+
+            return step
+
+        return begin
+
+    def colour(i: int) -> None:
+        lights.set_gain(scene.area_light, (1 + 0.1 * (i % 7), 1, 0.9))
+
+    def move(i: int) -> None:
+        lights.change(scene.area_light, to_world=_shifted(start[scene.area_light], 0.01 * (1 + i % 11)))
+
+    def turn(i: int) -> None:
+        lights.change(scene.dome, to_world=_turned(start[scene.dome], np.radians(3.0 * (1 + i))))
+
+    def amount(i: int) -> None:
+        live.set_amount("/edit", 0.3 + 0.05 * (i % 11))
+
+    def many_amount(i: int) -> None:
+        edit = scene.many.edits[i % len(scene.many.edits)]
+        live.set_amount(edit.path, 0.3 + 0.05 * (i % 11))
+
+    stroke = Stroke(scene.parts)
+    keyed = [with_amount(scene.stack, "/edit", amount) for amount in np.linspace(0.1, 1, 24)]
+
+    def play(i: int) -> None:
+        live.set_stack(keyed[i % len(keyed)])
+
+    return {
+        "light colour": prepared(scene.stack, colour),
+        "amount": prepared(scene.stack, amount),
+        "light move": prepared(scene.stack, move),
+        "dome rotation": prepared(scene.stack, turn),
+        "dab": prepared(stroke.stack, lambda i: stroke.dab(i)),
+        "play": prepared(scene.stack, play),
+        "64 edits: amount": prepared(scene.many, many_amount),
+        "64 edits: light move": prepared(scene.many, move),
+    }
+
+
+def lights_as_they_are(parts: Parts) -> list[np.ndarray]:
+    """Where each light stands."""
+    return [np.asarray(matrix, np.float64) for matrix in parts.snapshot.lights.to_world]
+
+
+def restore(parts: Parts, start: list[np.ndarray]) -> None:
+    """Put every light back where it was, at full quality and gain 1."""
+    for light, matrix in enumerate(start):
+        parts.lights.set_gain(light, (1, 1, 1))
+        if parts.snapshot.lights.kind[light] != int(LightKind.MESH):
+            parts.lights.change(light, to_world=matrix)
+    parts.refine_lights()
+
+
+def with_amount(stack: EditStack, path: str, amount: float) -> EditStack:
+    """The stack with another amount of one edit."""
+    edits = tuple(replace(edit, amount=float(amount)) if edit.path == path else edit for edit in stack.edits)
+    return replace(stack, edits=edits)
+
+
+def _same_bits(begin: Callable[[], Callable[[int], Any]]) -> bool:
+    """Whether the same three frames come out of one thread and of two."""
+    found = []
+    for threads in (1, 2):
+        with Threads(threads):
+            step = begin()
+            digest = hashlib.sha256()
+            for i in range(3):
+                digest.update(np.ascontiguousarray(step(i)).tobytes())
+        found.append(digest.digest())
+    return found[0] == found[1]
+
+
+def _shifted(matrix: np.ndarray, share: float) -> np.ndarray:
+    """A few centimetres to the side."""
+    moved = matrix.copy()
+    moved[:, 3] += share * np.array([1.0, 0.3, -0.5])
+    return moved
+
+
+def _turned(matrix: np.ndarray, angle: float) -> np.ndarray:
+    """Turned about the light's own Y, a dome's pole."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = matrix.copy()
+    turned[:, :3] = matrix[:, :3] @ np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    return turned
+
+
+def markdown(results: list[dict[str, Any]]) -> list[str]:
+    """Table for README: frames per second, two threads / one, spread as quartiles."""
+    found = [result["result"] | {"name": result["case"]["name"]} for result in results if "result" in result]
+    if not found:
+        return []
+    lines = [
+        "| change | goal | " + " | ".join(f"{one['name']} {one['width']} x {one['height']}" for one in found) + " |",
+        "| --- | ---: |" + " ---: |" * len(found),
+    ]
+    for change in dict.fromkeys(name for one in found for name in one["changes"]):
+        goals = {GOALS.get((one["width"], one["height"]), {}).get(change) for one in found} - {None}
+        cells = [_cell(one["changes"].get(change)) for one in found]
+        lines.append(f"| {change} | {', '.join(str(goal) for goal in sorted(goals))} | " + " | ".join(cells) + " |")
+    bits = [change["same_bits"] for one in found for change in one["changes"].values()]
+    lines += ["", f"Same bits for one thread and two: {'all' if all(bits) else 'NOT all'} of {len(bits)} changes."]
+    return lines
+
+
+def _cell(change: dict[str, Any] | None) -> str:
+    if change is None:
+        return ""
+    two, one = change["threads"]["2"], change["threads"]["1"]
+    return (
+        f"{1 / two['median']:.0f} ({1 / two['quartile_3']:.0f}-{1 / two['quartile_1']:.0f}) / {1 / one['median']:.0f}"
+    )

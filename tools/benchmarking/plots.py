@@ -1,0 +1,70 @@
+"""Plots of a report; needs matplotlib, which only developers install."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+from matplotlib import pyplot  # noqa: E402
+
+
+def plot(report: dict[str, Any], folder: Path) -> list[Path]:
+    """One image per suite that has something to show."""
+    makers = {"errors": _curve, "growth": _growth}
+    written = []
+    for name, maker in makers.items():
+        results = [one for one in report["suites"].get(name, []) if "result" in one]
+        if results:
+            path = folder / f"{name}.png"
+            if maker(results, path):
+                written.append(path)
+    return written
+
+
+def _curve(results: list[dict[str, Any]], path: Path) -> bool:
+    """Error against speed, over tolerances of packing."""
+    curves = {one["case"]["name"]: one["result"]["curve"] for one in results if one["result"].get("curve")}
+    if not curves:
+        return False
+    figure, axes = pyplot.subplots(figsize=(6, 4))
+    for name, points in curves.items():
+        axes.plot([p["fps"] for p in points], [100 * p["total"] for p in points], "o-", label=f"{name}, total")
+        axes.plot([p["fps"] for p in points], [100 * p["packing"] for p in points], "o--", label=f"{name}, packing")
+    axes.set_xlabel("frames per second, light colour")
+    axes.set_ylabel("relative RMS error, %")
+    axes.set_yscale("log")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+    _save(figure, path)
+    return True
+
+
+def _growth(results: list[dict[str, Any]], path: Path) -> bool:
+    """Time of a frame and memory over each size, relative to the smallest."""
+    kinds = list(dict.fromkeys(one["case"]["what"] for one in results))
+    figure, all_axes = pyplot.subplots(1, len(kinds), figsize=(3 * len(kinds), 3.2), squeeze=False)
+    for axes, kind in zip(all_axes[0], kinds, strict=True):
+        some = sorted((one for one in results if one["case"]["what"] == kind), key=lambda one: one["result"]["size"])
+        sizes = [one["result"]["size"] for one in some]
+        for name, values in {
+            "frame": [one["result"]["frame_seconds"] for one in some],
+            "build": [one["result"]["build_seconds"] for one in some],
+            "memory": [one["peak_mib"] for one in some],
+        }.items():
+            axes.plot(sizes, [value / values[0] for value in values], "o-", label=name)
+        axes.set_title(kind, fontsize=9)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+    all_axes[0][0].set_ylabel("over that of the smallest")
+    all_axes[0][0].legend(fontsize=7)
+    _save(figure, path)
+    return True
+
+
+def _save(figure: Any, path: Path) -> None:
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
