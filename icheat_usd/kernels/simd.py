@@ -173,6 +173,20 @@ def load_color(builder: Any, values: Any) -> Any:
     return _load(builder, values[0], _F4X)
 
 
+@_operation(color, types.int64)
+def load_rgb(builder: Any, values: Any) -> Any:
+    """Three float32 from an address, and 0."""
+    kind = ir.VectorType(_F32, 3)
+    return _picked(builder, _load(builder, values[0], kind), ir.Constant(kind, [0.0] * 3), [0, 1, 2, 3])
+
+
+@_operation(types.void, types.int64, color)
+def store_rgb(builder: Any, values: Any) -> None:
+    """The first three to an address."""
+    rgb = _picked(builder, values[1], values[1], [0, 1, 2])
+    builder.store(rgb, _at(builder, values[0], ir.VectorType(_F32, 3)), align=4)
+
+
 @_operation(color, color, types.float32)
 def scaled(builder: Any, values: Any) -> Any:
     """A colour times a number."""
