@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from icheat_usd.kernels._jit import parallel_kernel
+from icheat_usd.kernels._jit import kernel, parallel_kernel
 
 
 @parallel_kernel
@@ -44,18 +44,19 @@ def texel_positions(face_begin, points, face_uv, resolution, out):  # type: igno
                             )
 
 
+@kernel
+def _low_texel(place, resolution):  # type: ignore[no-untyped-def]
+    x = place * np.float32(resolution) - np.float32(0.5)
+    x = min(max(x, np.float32(0)), np.float32(resolution - 1))
+    return min(np.int64(x), max(resolution - 2, 0))
+
+
 @parallel_kernel
 def touched_places(places, row, uv, changed, out):  # type: ignore[no-untyped-def]
     """Whether one of the four texels around each place has changed; as `edits.masks.texel_weights` picks them."""
     resolution = changed.shape[1]
     for k in prange(len(places)):
-        place = places[k]
-        low = np.empty(2, np.int64)
-        for axis in range(2):
-            x = uv[place, axis] * np.float32(resolution) - np.float32(0.5)
-            x = min(max(x, np.float32(0)), np.float32(resolution - 1))
-            low[axis] = min(np.int64(x), max(resolution - 2, 0))
-        x0, y0 = low[0], low[1]
+        face = row[places[k]]
+        x0, y0 = _low_texel(uv[places[k], 0], resolution), _low_texel(uv[places[k], 1], resolution)
         x1, y1 = min(x0 + 1, resolution - 1), min(y0 + 1, resolution - 1)
-        face = row[place]
         out[k] = changed[face, y0, x0] or changed[face, y0, x1] or changed[face, y1, x0] or changed[face, y1, x1]

@@ -147,6 +147,94 @@ def compose(
             out[0, 1, c] = (carried if whole else 1.0) * out[0, 1, c] + added[c]
 
 
+@kernel
+def _piece_deltas(
+    piece,
+    row_changed,
+    version_sets,
+    set_sign,
+    sets,
+    version_restrict,
+    cell_begin,
+    entry_row,
+    entry_weight,
+    entry_slot,
+    slots,
+    row_table,
+    row_amount,
+    groups,
+    b,
+    area,
+    cells,
+    deltas,
+    total,
+):  # type: ignore[no-untyped-def]
+    """One piece of `version_deltas`."""
+    version = piece[0]
+    restrict = version_restrict[version, 0]
+    unedited = version_restrict[version, 1]
+    reach = version_restrict[version, 2]
+    n_groups = len(b)
+    found = np.empty((n_groups, 4, 3))
+    value = np.empty(3)
+    edit = row_table[restrict, 0] if restrict >= 0 else 0
+    whole = True
+    for g in range(n_groups):
+        whole = whole and (restrict < 0 or groups[edit, g] != 0)
+    total[:] = 0.0
+    for k in range(piece[1], piece[2]):
+        cell = cells[k]
+        first, end = cell_begin[cell], cell_begin[cell + 1]
+        if row_changed[0] == 0 and not _concerned(row_changed, entry_row, first, end):
+            continue
+        share = 1.0
+        if restrict >= 0:
+            share = 0.0
+            for entry in range(first, end):
+                if entry_row[entry] == restrict:
+                    share = np.float64(entry_weight[entry])
+        value[:] = share if reach != 0 else 0.0
+        if reach == 0:
+            for s in range(version_sets[version], version_sets[version + 1]):
+                weight = set_sign[s] * share
+                compose(
+                    sets[s],
+                    first,
+                    end,
+                    entry_row,
+                    entry_weight,
+                    entry_slot,
+                    slots,
+                    row_table,
+                    row_amount,
+                    groups,
+                    b,
+                    cell,
+                    found,
+                )
+                for c in range(3):
+                    light = found[0, 1, c] if whole else 0.0
+                    for g in range(n_groups):
+                        if restrict >= 0 and groups[edit, g] == 0:
+                            continue
+                        scale = found[g, 0, c] - 1.0 if unedited != 0 else found[g, 0, c]
+                        light += scale * b[g, cell, c]
+                        radiance = weight * area[cell] * b[g, cell, c]
+                        total[c] += found[g, 2, c] * radiance
+                        total[3 + c] += found[g, 3, c] * radiance
+                    value[c] += weight * light
+        for c in range(3):
+            deltas[k, c] = value[c]
+
+
+@kernel
+def _concerned(row_changed, entry_row, first, end):  # type: ignore[no-untyped-def]
+    for entry in range(first, end):
+        if row_changed[1 + entry_row[entry]] != 0:
+            return True
+    return False
+
+
 @parallel_kernel
 def version_deltas(
     pieces,
@@ -184,70 +272,50 @@ def version_deltas(
     cells, deltas : (n_cells,), (n_cells, 3)
     offsets : (n, 6) float64
     """
-    n_groups = len(b)
     for p in prange(len(pieces)):
-        version = pieces[p, 0]
-        restrict = version_restrict[version, 0]
-        unedited = version_restrict[version, 1]
-        reach = version_restrict[version, 2]
-        found = np.empty((n_groups, 4, 3))
-        total = np.zeros(6)
-        for k in range(pieces[p, 1], pieces[p, 2]):
-            cell = cells[k]
-            first, end = cell_begin[cell], cell_begin[cell + 1]
-            if row_changed[0] == 0:
-                concerned = False
-                for entry in range(first, end):
-                    concerned = concerned or row_changed[1 + entry_row[entry]] != 0
-                if not concerned:
-                    continue
-            share = 1.0
-            whole = True
-            edit = 0
-            if restrict >= 0:
-                share = 0.0
-                for entry in range(first, end):
-                    if entry_row[entry] == restrict:
-                        share = np.float64(entry_weight[entry])
-                edit = row_table[restrict, 0]
-                for g in range(n_groups):
-                    whole = whole and groups[edit, g] != 0
-            value = np.zeros(3)
-            if reach != 0:
-                value[:] = share
-            else:
-                for s in range(version_sets[version], version_sets[version + 1]):
-                    sign = set_sign[s]
-                    compose(
-                        sets[s],
-                        first,
-                        end,
-                        entry_row,
-                        entry_weight,
-                        entry_slot,
-                        slots,
-                        row_table,
-                        row_amount,
-                        groups,
-                        b,
-                        cell,
-                        found,
-                    )
-                    for c in range(3):
-                        light = found[0, 1, c] if whole else 0.0
-                        for g in range(n_groups):
-                            if restrict >= 0 and groups[edit, g] == 0:
-                                continue
-                            scale = found[g, 0, c] - 1.0 if unedited != 0 else found[g, 0, c]
-                            light += scale * b[g, cell, c]
-                            radiance = sign * share * area[cell] * b[g, cell, c]
-                            total[c] += found[g, 2, c] * radiance
-                            total[3 + c] += found[g, 3, c] * radiance
-                        value[c] += sign * share * light
-            for c in range(3):
-                deltas[k, c] = value[c]
-        for c in range(6):
-            offsets[p, c] = total[c]
+        _piece_deltas(
+            pieces[p],
+            row_changed,
+            version_sets,
+            set_sign,
+            sets,
+            version_restrict,
+            cell_begin,
+            entry_row,
+            entry_weight,
+            entry_slot,
+            slots,
+            row_table,
+            row_amount,
+            groups,
+            b,
+            area,
+            cells,
+            deltas,
+            offsets[p],
+        )
+
+
+@kernel
+def _haar_of_one(deltas, nodes, child, share, root, out):  # type: ignore[no-untyped-def]
+    mean = np.empty((len(nodes), 3))
+    for k in range(len(nodes)):
+        node = nodes[k]
+        for c in range(3):
+            left, right = 0.0, 0.0
+            place = child[k, 0]
+            if place >= 0:
+                left = mean[place >> 1, c] if place & 1 else np.float64(deltas[place >> 1, c])
+            place = child[k, 1]
+            if place >= 0:
+                right = mean[place >> 1, c] if place & 1 else np.float64(deltas[place >> 1, c])
+            mean[k, c] = share[node, 0] * left + share[node, 1] * right
+            out[1 + node, c] = (left - right) * share[node, 2]
+    for c in range(3):
+        if len(nodes) > 0:
+            out[0, c] = mean[len(nodes) - 1, c] * root
+        elif len(deltas) > 0 and len(share) == 0:
+            out[0, c] = np.float64(deltas[0, c]) * root
 
 
 @parallel_kernel
@@ -268,26 +336,15 @@ def haar_of_cells(versions, version_cells, deltas, version_nodes, nodes, child, 
     """
     for index in prange(len(versions)):
         version = versions[index]
-        first, end = version_nodes[version], version_nodes[version + 1]
-        cell = version_cells[version]
-        mean = np.zeros((max(end - first, 1), 3))
-        for k in range(first, end):
-            node = nodes[k]
-            for c in range(3):
-                left, right = 0.0, 0.0
-                place = child[k, 0]
-                if place >= 0:
-                    left = mean[place >> 1, c] if place & 1 else np.float64(deltas[cell + (place >> 1), c])
-                place = child[k, 1]
-                if place >= 0:
-                    right = mean[place >> 1, c] if place & 1 else np.float64(deltas[cell + (place >> 1), c])
-                mean[k - first, c] = share[node, 0] * left + share[node, 1] * right
-                out[version, 1 + node, c] = (left - right) * share[node, 2]
-        for c in range(3):
-            if end > first:
-                out[version, 0, c] = mean[end - first - 1, c] * root
-            elif version_cells[version + 1] > cell and len(share) == 0:
-                out[version, 0, c] = np.float64(deltas[cell, c]) * root
+        cell, first = version_cells[version], version_nodes[version]
+        _haar_of_one(
+            deltas[cell : version_cells[version + 1]],
+            nodes[first : version_nodes[version + 1]],
+            child[first : version_nodes[version + 1]],
+            share,
+            root,
+            out[version],
+        )
 
 
 @parallel_kernel
@@ -300,45 +357,62 @@ def spread_cells(versions, version_cells, cells, deltas, out):  # type: ignore[n
                 out[version, cells[k], c] = deltas[k, c]
 
 
-@parallel_kernel
-def nodes_of_cells(cells, cell_begin, parent_of_leaf, parent, left, right, count, nodes, child, begin, fill):  # type: ignore[no-untyped-def]
-    """Nodes above the cells of each version, children first; counts them alone while `fill` is 0.
+@kernel
+def nodes_above(cells, parent_of_leaf, parent, left, right, count, nodes, child):  # type: ignore[no-untyped-def]
+    """Nodes above some cells, children first; how many goes to ``count[0]``, and if `nodes` is empty that is all.
 
-    Nodes are in pre-order, so that descending numbers meet children before parents.
+    Nodes are in pre-order, so that descending numbers meet children before parents. See `haar_of_cells`.
     """
     n_nodes = len(parent)
-    n_leaves = len(parent_of_leaf)
-    for version in prange(len(count)):
-        first, end = cell_begin[version], cell_begin[version + 1]
-        place = np.full(n_nodes, -1, np.int32)
-        found = 0
-        for k in range(first, end):
-            node = parent_of_leaf[cells[k]]
-            while node >= 0 and place[node] < 0:
-                place[node] = 0
-                found += 1
-                node = parent[node]
-        count[version] = found
-        if fill == 0 or found == 0:
+    place = np.full(n_nodes, -1, np.int32)
+    count[0] = 0
+    for cell in cells:
+        node = parent_of_leaf[cell]
+        while node >= 0 and place[node] < 0:
+            place[node] = 0
+            count[0] += 1
+            node = parent[node]
+    if len(nodes) == 0:
+        return
+    of_leaf = np.full(len(parent_of_leaf), -1, np.int32)
+    for k in range(len(cells)):
+        of_leaf[cells[k]] = k
+    k = 0
+    for step in range(n_nodes):
+        node = n_nodes - 1 - step
+        if place[node] < 0:
             continue
-        of_leaf = np.full(n_leaves, -1, np.int32)
-        for k in range(first, end):
-            of_leaf[cells[k]] = k - first
-        k = begin[version]
-        for step in range(n_nodes):
-            node = n_nodes - 1 - step
-            if place[node] < 0:
-                continue
-            place[node] = k - begin[version]
-            nodes[k] = node
-            for side in range(2):
-                below = left[node] if side == 0 else right[node]
-                if below < 0:
-                    leaf = of_leaf[-1 - below]
-                    child[k, side] = 2 * leaf if leaf >= 0 else -1
-                else:
-                    child[k, side] = 2 * place[below] + 1 if place[below] >= 0 else -1
-            k += 1
+        place[node] = k
+        nodes[k] = node
+        for side in range(2):
+            below = left[node] if side == 0 else right[node]
+            if below < 0:
+                leaf = of_leaf[-1 - below]
+                child[k, side] = 2 * leaf if leaf >= 0 else -1
+            else:
+                child[k, side] = 2 * place[below] + 1 if place[below] >= 0 else -1
+        k += 1
+
+
+@kernel
+def _multiply_pair(first, end, index, scale, value, coefficients, out):  # type: ignore[no-untyped-def]
+    sums = np.zeros((3, 64), np.float32)
+    for entry in range(first, end):
+        color = coefficients[index[entry]]
+        r, g, b = color[0], color[1], color[2]
+        if r == 0 and g == 0 and b == 0:
+            continue
+        r *= scale[entry]
+        g *= scale[entry]
+        b *= scale[entry]
+        for lane in range(64):
+            weight = np.float32(value[entry, lane])
+            sums[0, lane] += weight * r
+            sums[1, lane] += weight * g
+            sums[2, lane] += weight * b
+    for lane in range(64):
+        for c in range(3):
+            out[lane, c] = sums[c, lane]
 
 
 @parallel_kernel
@@ -347,29 +421,9 @@ def multiply_pairs(tile_begin, index, scale, value, coefficients, pairs, pair_ti
     for k in prange(len(pairs)):
         p = pairs[k]
         tile = pair_tile[p]
-        version = pair_version[p]
-        red = np.zeros(64, np.float32)
-        green = np.zeros(64, np.float32)
-        blue = np.zeros(64, np.float32)
-        for entry in range(tile_begin[tile], tile_begin[tile + 1]):
-            column = index[entry]
-            r = coefficients[version, column, 0]
-            g = coefficients[version, column, 1]
-            b = coefficients[version, column, 2]
-            if r == 0 and g == 0 and b == 0:
-                continue
-            r *= scale[entry]
-            g *= scale[entry]
-            b *= scale[entry]
-            for lane in range(64):
-                weight = np.float32(value[entry, lane])
-                red[lane] += weight * r
-                green[lane] += weight * g
-                blue[lane] += weight * b
-        for lane in range(64):
-            out[p, lane, 0] = red[lane]
-            out[p, lane, 1] = green[lane]
-            out[p, lane, 2] = blue[lane]
+        _multiply_pair(
+            tile_begin[tile], tile_begin[tile + 1], index, scale, value, coefficients[pair_version[p]], out[p]
+        )
 
 
 @parallel_kernel

@@ -229,9 +229,6 @@ class LiveRelighter:
 
     # Structure --------------------------------------------------------------------------------------------------------
 
-    def _light_paths(self) -> tuple[str, ...]:
-        return tuple(getattr(self.lights, "paths", self._snapshot.light_paths))
-
     def _changed(self, change: Change | None) -> None:
         if change is None:
             self._regroup()

@@ -174,7 +174,8 @@ class LiveStack:
 
     def _exchanged(self, edit: int, now: Edit) -> _Exchange:
         before = self.field.edits[edit]
-        bound, sides = replace(before, edit=now), []
+        bound = replace(before, edit=now)
+        sides: list[list[tuple[int, I64, F32]]] = []
         for side, points in ((RECEIVERS, self._view.points), (CASTERS, self._gather.points)):
             sides.append([])
             for key, row in enumerate(self._rows(edit)):

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.samples import ClusterTree
-from icheat_usd.scene import F32, F64, I32, I64
+from icheat_usd.scene import F32, F64, I32, I64, U8
 from icheat_usd.transport import SparseRows, Transport
 from icheat_usd.transport.packed import LANES, PackedTransport
 
 
-class VersionTables(Protocol):
-    """The columns of `relight.versions` that products look at."""
+class VersionTables(NamedTuple):
+    """All versions, one after the other."""
 
     cell_begin: I64
     cells: I32
     node_begin: I64
     nodes: I32
-    child: I32
+    child: I32  #: (n_nodes, 2) see `kernels.versions.haar_of_cells`
+    set_begin: I64
+    sets: U8
+    sign: F64
+    restrict: I64  #: (n_versions, 3) see `kernels.versions.version_deltas`
 
 
 class Products:
@@ -66,23 +70,10 @@ class Products:
         if not self._haar or not len(cells):
             return np.empty(0, np.int32), np.empty((0, 2), np.int32)
         tree, count = self._tree, np.zeros(1, np.int64)
-        begin = np.array([0, len(cells)], np.int64)
         nodes, child = np.empty(0, np.int32), np.empty((0, 2), np.int32)
-        for fill in (0, 1):
-            kernels.nodes_of_cells(
-                cells,
-                begin,
-                self._parent_of_leaf,
-                self._parent,
-                tree.left,
-                tree.right,
-                count,
-                nodes,
-                child,
-                np.zeros(1, np.int64),
-                fill,
-            )
-            if fill == 0:
+        for _ in range(2):
+            kernels.nodes_above(cells, self._parent_of_leaf, self._parent, tree.left, tree.right, count, nodes, child)
+            if not len(nodes):
                 nodes, child = np.empty(count[0], np.int32), np.empty((count[0], 2), np.int32)
         return nodes, child
 

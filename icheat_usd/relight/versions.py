@@ -10,7 +10,7 @@ import numpy as np
 
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.relight.compiled import CompiledStack
-from icheat_usd.relight.products import Products
+from icheat_usd.relight.products import Products, VersionTables
 from icheat_usd.scene import F32, F64, I32, I64, U8
 
 #: Casters of a version that are evaluated in one piece.
@@ -36,20 +36,6 @@ class _Version(NamedTuple):
     rows: frozenset[int]  #: of the stack, on which it depends
 
 
-class _Tables(NamedTuple):
-    """All versions, one after the other."""
-
-    cell_begin: I64
-    cells: I32
-    node_begin: I64
-    nodes: I32
-    child: I32
-    set_begin: I64
-    sets: U8
-    sign: F64
-    restrict: I64  #: (n_versions, 3) see `kernels.versions.version_deltas`
-
-
 class Versions:
     """The versions that groups of receivers ask for, and for each the tiles of rows that some receiver needs.
 
@@ -61,7 +47,7 @@ class Versions:
         self._compiled, self._products, self._area = compiled, products, area
         self._number: dict[VersionKey, int] = {}
         self._versions: list[_Version] = []
-        self._tables: _Tables | None = None
+        self._tables: VersionTables | None = None
         self._deltas: F32 = np.zeros((0, 3), np.float32)
         self._stale: set[int] = set()
         self._pairs_of: list[I64] = []
@@ -189,7 +175,7 @@ class Versions:
         versions = self._versions
         n_known = len(self.offsets)
         known_cells = len(self._deltas)
-        self._tables = _Tables(
+        self._tables = VersionTables(
             _begins([len(v.cells) for v in versions]),
             np.concatenate([np.empty(0, np.int32), *(v.cells for v in versions)]),
             _begins([len(v.nodes) for v in versions]),
