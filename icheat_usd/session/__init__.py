@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from icheat_usd.session.explain import contribution_film, explain_pixel
     from icheat_usd.session.inspection import check
     from icheat_usd.session.keys import copy_key, list_keys, remove_key, set_key
+    from icheat_usd.session.live import LiveSession
     from icheat_usd.session.publishing import publish
     from icheat_usd.session.quality import DRAFT, Quality
 
 __all__ = [
     "DRAFT",
     "GatherSettings",
+    "LiveSession",
     "Quality",
     "Session",
     "add_edit",
@@ -61,6 +63,7 @@ _HOMES = {
     "set_key": "icheat_usd.session.keys",
     "soft_sphere": "icheat_usd.edits.painting",
     "GatherSettings": "icheat_usd.final_gather",
+    "LiveSession": "icheat_usd.session.live",
     "Session": "icheat_usd.session.document",
     "DRAFT": "icheat_usd.session.quality",
     "Quality": "icheat_usd.session.quality",

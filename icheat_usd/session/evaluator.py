@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,8 @@ from icheat_usd.errors import EditError
 from icheat_usd.relight import RelitView
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.relight.live import LiveRelighter
-from icheat_usd.scene import F32, F64, LightKind, SceneSnapshot
+from icheat_usd.scene import F32, F64, LightKind
+from icheat_usd.session.light_changes import light_of_stage
 from icheat_usd.session.live_state import UNCHANGED, EditChange, LightChange, LiveState
 from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.transport import HeldBack, Transport
@@ -50,6 +50,7 @@ class Evaluator:
             parts.snapshot, parts.view, parts.gather, transport, self.lights, held_back=held_back
         )
         self._shown = UNCHANGED
+        self._stack: EditStack | None = None
         self._own_rows = {path: row for row, path in reversed(list(enumerate(parts.snapshot.light_paths)))}
         self._laid: dict[str, tuple[Edit, EditChange, Edit]] = {}
 
@@ -61,10 +62,12 @@ class Evaluator:
         EditError, LightError
             A value does not fit; the lights are then as before.
         """
+        if state is self._shown and stack is self._stack:
+            return
         if state.lights is not self._shown.lights:
             self._show_lights(self._shown, state)
         self.relighter.set_stack(self._laid_over(stack, state))
-        self._shown = state
+        self._shown, self._stack = state, stack
 
     def frame(self, out: F32 | None = None) -> F32:
         """(height, width, 3) float32, scene-linear beauty."""
@@ -159,35 +162,3 @@ class Evaluator:
 
     def _value_of_stage(self, path: str) -> LightChange:
         return light_of_stage(self._snapshot, path)
-
-
-def light_of_stage(snapshot: SceneSnapshot, path: str) -> LightChange:
-    """What a stage says about one of its lights, as a complete `LightChange`.
-
-    Raises
-    ------
-    EditError
-        It has no such light.
-    """
-    if path not in snapshot.light_paths:
-        known = ", ".join(snapshot.light_paths) or "none"
-        raise EditError(f"there is no light {path} at this frame; there are {known}")
-    row = snapshot.light_paths.index(path)
-    lights, textures = snapshot.lights, snapshot.textures
-    to_world = lights.to_world[row].astype(np.float64)
-    to_world[:, 3] += snapshot.centre
-    image: F32 = np.zeros((0, 0, 3), np.float32)
-    if lights.texture[row] >= 0:
-        texture = int(lights.texture[row])
-        begin, width, height = (int(t[texture]) for t in (textures.begin, textures.width, textures.height))
-        image = textures.texels[begin : begin + width * height].reshape(height, width, 4)
-    return LightChange(
-        to_world=to_world,
-        radiance=_triple(lights.radiance[row]),
-        size=(float(lights.size[row, 0]), float(lights.size[row, 1])),
-        texture=image,
-    )
-
-
-def _triple(values: Sequence[float] | F32) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,331 @@
+"""The frames of a live session: made in the background, coarse ones first, and kept at one `LiveState`."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from enum import StrEnum
+
+from icheat_usd.edits.model import EMPTY_STACK, EditStack
+from icheat_usd.errors import IcheatError
+from icheat_usd.kernels._jit import kernels_may_overlap
+from icheat_usd.progress import silent
+from icheat_usd.scene import SceneSnapshot
+from icheat_usd.session import authoring
+from icheat_usd.session.background import Background, Job
+from icheat_usd.session.content_keys import digest
+from icheat_usd.session.dabs import TexelPlaces
+from icheat_usd.session.document import Session
+from icheat_usd.session.evaluator import Evaluator
+from icheat_usd.session.frames import ResidentFrames, SharedParts, share_tables
+from icheat_usd.session.live_state import UNCHANGED, LiveState
+from icheat_usd.session.quality import coarse
+from icheat_usd.session.shot_parts import ShotParts
+from icheat_usd.stage.edit_stack import read_edit_stack
+
+
+class Level(StrEnum):
+    """How good the image of a frame is."""
+
+    NONE = "none"
+    PREVIEW = "preview"  #: coarse, for orientation
+    FULL = "full"  #: all rows that the quality asks for; lights that moved may still be noisy
+    REST = "rest"  #: nothing is left to be done
+
+    def reaches(self, other: Level) -> bool:
+        return _ORDER[self] >= _ORDER[other]
+
+
+_ORDER = {level: i for i, level in enumerate(Level)}
+
+
+@dataclass(frozen=True)
+class LiveEvent:
+    """What listeners hear; from the background thread, so hand it on to the window's own."""
+
+    kind: str  #: "progress", "better" (show the frame again) or "error"
+    frame: float | None
+    level: Level
+    step: str = ""
+    fraction: float = 0.0
+    error: Exception | None = None
+
+
+Listener = Callable[[LiveEvent], None]
+
+
+class LiveFrame:
+    """One frame: what the stage says at it, and the best that there is to show it with."""
+
+    def __init__(self, snapshot: SceneSnapshot) -> None:
+        self.snapshot = snapshot
+        self.stack: EditStack | None = None
+        self.stack_version = 0
+        self.places = TexelPlaces(snapshot)
+        self.evaluator: Evaluator | None = None
+        self.level = Level.NONE
+
+
+class LiveFrames:
+    """Frames around a playhead, getting better by themselves, all at one state.
+
+    Parameters
+    ----------
+    session : Session
+        Stage, camera, size and quality; its frame is where the playhead stands first.
+    memory : bytes
+        Limit of all frames together.
+    """
+
+    def __init__(self, session: Session, memory: int) -> None:
+        self.session = session
+        self.state = UNCHANGED
+        self.prefetch: tuple[float, ...] = ()  #: frames to prepare when the one at the playhead is done
+        self.stage_lock = threading.RLock()  #: held after that of commands, never before it
+        self.resident: ResidentFrames[LiveFrame] = ResidentFrames(memory)
+        self.resident.move(session.frame)
+        self._shared = SharedParts()
+        self._stack_version = 0  #: grows when edits are written to the stage
+        self._listeners: list[Listener] = []
+        self._failed: dict[tuple[float | None, Level], Exception] = {}
+        self._building: dict[tuple[float | None, Level], ShotParts] = {}
+        self._job: tuple[float | None, Level] = (None, Level.NONE)
+        self._background = Background(self._next_job, self._on_error, kernels_may_overlap)
+        self._background.start()
+
+    # For commands -----------------------------------------------------------------------------------------------------
+
+    def command(self) -> AbstractContextManager[None]:
+        """Held while frames are looked at or changed; the background lets it go first."""
+        return self._background.command()
+
+    @property
+    def level(self) -> Level:
+        """How good the image at the playhead is."""
+        frame = self.resident.get(self.resident.playhead)
+        return Level.NONE if frame is None else frame.level
+
+    def wait(self, level: Level, timeout: float | None = None) -> bool:
+        """Wait until the frame at the playhead is this good; false if `timeout` seconds were not enough.
+
+        Raises
+        ------
+        IcheatError
+            It cannot be made, or the session is closed.
+        """
+        if self.level.reaches(level):
+            return True
+        done = self._background.wait_for(lambda: self.level.reaches(level) or self._failure() is not None, timeout)
+        if not self.level.reaches(level):
+            failure = self._failure()
+            if failure is not None:
+                raise failure
+            if self._background.is_closing:
+                raise IcheatError("the live session is closed; open another one")
+        return done
+
+    def here(self) -> LiveFrame:
+        """The frame at the playhead, with something to show it with."""
+        self.wait(Level.PREVIEW)
+        frame = self.resident.get(self.resident.playhead)
+        assert frame is not None
+        return frame
+
+    def shown(self) -> Evaluator:
+        """What shows the frame at the playhead, at the state."""
+        frame = self.here()
+        assert frame.evaluator is not None
+        frame.evaluator.show(self.stack_of(frame), self.state)
+        return frame.evaluator
+
+    def set_state(self, state: LiveState) -> None:
+        """Show a state, or say why it cannot be shown and stay.
+
+        Raises
+        ------
+        EditError, LightError
+            A value does not fit the scene.
+        """
+        frame, before = self.resident.get(self.resident.playhead), self.state
+        if frame is not None and frame.evaluator is not None:
+            stack = self.stack_of(frame)
+            try:
+                frame.evaluator.show(stack, state)
+            except IcheatError:
+                frame.evaluator.show(stack, before)
+                raise
+            if state.lights is not before.lights:
+                self._lights_changed()
+        self.state = state
+
+    def stack_of(self, frame: LiveFrame) -> EditStack:
+        """What the stage says about edits at a frame."""
+        if frame.stack is None or frame.stack_version != self._stack_version:
+            version = self._stack_version
+            frame.stack, frame.stack_version = self._read_stack(frame.snapshot), version
+        return frame.stack
+
+    def stacks_changed(self) -> None:
+        """Edits were written to the stage."""
+        self._stack_version += 1
+        self._failed.clear()
+
+    def scrub(self, frame: float | None) -> bool:
+        """Put the playhead at a frame; whether it can be shown without waiting."""
+        with self.command():
+            self.resident.move(frame)
+            self.session.frame = frame
+            ready = self.level is not Level.NONE
+        self._background.wake(stop_job=self._job[0] != frame)
+        return ready
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
+
+    def close(self) -> None:
+        self._background.close()
+
+    def _lights_changed(self) -> None:
+        for number in self.resident.frames():
+            frame = self.resident.get(number)
+            if frame is not None and frame.level is Level.REST:
+                frame.level = Level.FULL
+        self._background.wake()
+
+    def _read_stack(self, snapshot: SceneSnapshot) -> EditStack:
+        surfaces = {surface.path for surface in snapshot.surfaces}
+        with self.stage_lock:
+            path = self.session.stack_path
+            if path is None:
+                return EMPTY_STACK
+            time, read = snapshot.time_code, authoring.read_payload
+            return read_edit_stack(self.session.stage, path, time, surfaces, read, with_muted=True)[0]
+
+    # Background -------------------------------------------------------------------------------------------------------
+
+    def _next_job(self) -> Job | None:
+        playhead = self.resident.playhead
+        for frame, level in self._wanted():
+            entry = self.resident.get(frame)
+            reached = Level.NONE if entry is None else entry.level
+            if (frame, level) in self._failed or reached.reaches(level):
+                continue
+            self._job = frame, level
+            if level is Level.REST:
+                return lambda frame=frame: self._refine(frame)  # type: ignore[misc]
+            return lambda frame=frame, level=level: self._make(frame, level)  # type: ignore[misc]
+        self._job = playhead, Level.REST
+        return None
+
+    def _wanted(self) -> Iterator[tuple[float | None, Level]]:
+        """What to make, in this order."""
+        playhead, direction = self.resident.playhead, self.resident.direction
+        for level in (Level.PREVIEW, Level.FULL, Level.REST):
+            yield playhead, level
+        if playhead is None:
+            return
+        ahead = sorted(self.prefetch, key=lambda frame: ((frame - playhead) * direction < 0, abs(frame - playhead)))
+        for level in (Level.PREVIEW, Level.FULL):
+            for frame in ahead:
+                if frame != playhead and not self._is_full(frame):
+                    yield frame, level
+
+    def _is_full(self, frame: float) -> bool:
+        """Whether making this frame would only push out another one that is as useful."""
+        if self.resident.get(frame) is not None:
+            return False
+        return self.resident.bytes() >= self.resident.limit
+
+    def _make(self, number: float | None, level: Level) -> None:
+        began = time.perf_counter()
+        parts = self._parts(number, level)
+        with self._background.lock:
+            state, entry = self.state, self.resident.get(number)
+        frame = LiveFrame(parts.snapshot) if entry is None else entry
+        stack = self._read_stack(parts.snapshot)
+        evaluator, is_new = self._evaluator(parts)
+        if is_new:
+            # Without the lock: lights that were changed are worked out here.
+            evaluator.show(stack, state)
+        with self._background.lock:
+            evaluator.show(self.stack_of(frame), self.state)
+            frame.evaluator, frame.level = evaluator, level
+            self.resident.put(number, frame, time.perf_counter() - began)
+        self._building.pop((number, level), None)
+        self._tell(LiveEvent("better", number, level))
+
+    def _evaluator(self, parts: ShotParts) -> tuple[Evaluator, bool]:
+        """One for all frames that look the same but for their edits; whether it was made now."""
+        keys = parts.keys
+        key = digest(keys.transport, keys.view, keys.cell_light, keys.view_light, parts.snapshot.centre)
+        made: list[Evaluator] = []
+
+        def make() -> Evaluator:
+            made.append(Evaluator(parts, parts.transport, parts.quality.light_samples))
+            return made[0]
+
+        return self._shared.get("evaluator", key, make), bool(made)
+
+    def _parts(self, number: float | None, level: Level) -> ShotParts:
+        """The parts of a frame at a level; those that are done are kept when another job is more urgent."""
+        if (number, level) not in self._building:
+            session = self.session
+            quality = session.quality if level is Level.FULL else coarse(session.quality)
+            entry = self.resident.get(number)
+            snapshot = self._read_snapshot(number) if entry is None else entry.snapshot
+            self._building[number, level] = ShotParts(
+                quality,
+                snapshot=snapshot,
+                engine=session._engine,
+                progress=self._progress,
+                disk=session._disk,
+                memory=self._shared,
+            )
+        return self._building[number, level]
+
+    def _read_snapshot(self, number: float | None) -> SceneSnapshot:
+        """The stage at a frame; tables that are as in a resident frame are the same objects."""
+        shot = self.session.at(number)
+        shot.progress = silent
+        with self.stage_lock:
+            snapshot = shot.snapshot
+        for other in (self.resident.playhead, *self.resident.frames()):
+            entry = self.resident.get(other)
+            if entry is not None:
+                return share_tables(snapshot, entry.snapshot)
+        return snapshot
+
+    def _refine(self, number: float | None) -> None:
+        while True:
+            self._background.progress()
+            with self._background.lock:
+                frame = self.resident.get(number)
+                if frame is None or frame.evaluator is None or frame.level is not Level.FULL:
+                    return
+                frame.evaluator.show(self.stack_of(frame), self.state)
+                if not frame.evaluator.refine():
+                    frame.level = Level.REST
+                    break
+        self._tell(LiveEvent("better", number, Level.REST))
+
+    def _progress(self, step: str, fraction: float) -> None:
+        self._background.progress()
+        self._tell(LiveEvent("progress", self._job[0], self._job[1], step, fraction))
+
+    def _failure(self) -> Exception | None:
+        playhead = self.resident.playhead
+        return next((error for (frame, _), error in self._failed.items() if frame == playhead), None)
+
+    def _on_error(self, error: Exception) -> None:
+        self._failed[self._job] = error
+        self._building.pop(self._job, None)
+        self._tell(LiveEvent("error", self._job[0], self._job[1], error=error))
+
+    def _tell(self, event: LiveEvent) -> None:
+        self._background.notify()
+        for listener in tuple(self._listeners):
+            listener(event)
