@@ -57,7 +57,7 @@ def test_a_changed_constant_or_helper_in_another_file_is_seen_and_the_same_sourc
     for package in (kernels.parent, kernels):
         (package / "__init__.py").touch()
     shutil.copy(PACKAGE / "_jit.py", kernels)
-    for name in ("resources.py", "errors.py"):
+    for name in ("cache_folder.py",):
         shutil.copy(PACKAGE.parent / name, kernels.parent)
     (kernels / "caller.py").write_text(CALLER)
     assert answer_of(tmp_path, 10, 2) == (20, 0)

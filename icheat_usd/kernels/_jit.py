@@ -31,7 +31,7 @@ import llvmlite.binding  # noqa: E402
 import numba  # noqa: E402
 import numpy as np  # noqa: E402
 
-from icheat_usd.resources import cache_folder  # noqa: E402
+from icheat_usd.cache_folder import cache_folder  # noqa: E402
 
 _KERNELS = Path(__file__).parent
 _PACKAGE = "icheat_usd.kernels"

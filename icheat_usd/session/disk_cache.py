@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import IO, Any
 from uuid import uuid4
 
+from icheat_usd.cache_folder import cache_folder
 from icheat_usd.errors import IcheatError
-from icheat_usd.resources import cache_folder
 from icheat_usd.session import parts
 
 #: Bytes that the cache may take if ``$ICHEAT_CACHE_SIZE`` says nothing: a dozen uncompressed previews.
