@@ -16,6 +16,7 @@ from icheat_usd.final_gather.gatherer import Gatherer, gathered_light
 from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import take_points
 from icheat_usd.relight import Relighter
+from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.scene import F32
 from icheat_usd.transport import CellLight, build_bounces, light_cells
 from tools.benchmarking.converged import (
@@ -29,6 +30,7 @@ from tools.benchmarking.converged import (
 )
 from tools.benchmarking.error_images import write_error_image, write_signed_image
 from tools.benchmarking.made_up_edits import edits_of_objects_and_brushes, one_edit, ranked_paths
+from tools.benchmarking.meter import repeat
 from tools.benchmarking.parts import Parts
 from tools.benchmarking.statistics import RelativeError, relative_error, relative_error_of_halves
 
@@ -45,6 +47,13 @@ class ErrorSettings:
     hit_pixels: int = 200  #: for the comparison with light at true hits
     hit_rays: int = 1024
     n_bounces: int = 16
+    tolerances: tuple[float, ...] = (
+        0.1,
+        0.05,
+        0.025,
+        0.0125,
+        0.006,
+    )  #: of packing, for the curve of error against speed
     seed: int = 20_061
 
 
@@ -75,6 +84,7 @@ def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -
     for name, error in _interpolation(parts, references, settings, names):
         found["lights"][name] |= error
     found["edits"] = _of_edits(parts, references, settings)
+    found["curve"] = _curve(parts, references, settings)
     if settings.hit_pixels:
         found["cells_against_true_hits"] = _against_true_hits(parts, references, settings, names)
     if folder is not None:
@@ -108,8 +118,15 @@ def _of_light(parts: Parts, references: References, light: int) -> dict[str, Any
     """Total error at frame rate, and where it comes from."""
     probe, b = references.probe, parts.lights.radiance[light]
     packed = probe.to_pixels(parts.packed.to_view(b)[probe.samples])
+    shown = {
+        name: probe.to_pixels(parts.shown(light, at_rest=name == "at_rest")[probe.samples])
+        for name in ("total", "at_rest")
+    }
     found = {
-        "total": relative_error(packed, references.own_b[0][light], references.own_b[1][light]),
+        **{
+            name: relative_error(image, references.own_b[0][light], references.own_b[1][light])
+            for name, image in shown.items()
+        },
         "transport": relative_error(packed, references.same_b[0][light], references.same_b[1][light]),
         "cell_light": relative_error_of_halves(
             references.same_b[0][light],
@@ -121,7 +138,7 @@ def _of_light(parts: Parts, references: References, light: int) -> dict[str, Any
     if parts.transport is not None:
         exact = probe.to_pixels(parts.transport.to_view(b)[probe.samples])
         found["packing"] = _difference(packed, exact, references, light)
-        found["rest"] = relative_error(exact, references.own_b[0][light], references.own_b[1][light])
+        found["unpacked"] = relative_error(exact, references.own_b[0][light], references.own_b[1][light])
     return {name: error.as_dict() for name, error in found.items()}
 
 
@@ -186,6 +203,39 @@ def _lobe_products(parts: Parts, view: Any, n_rays: int, seed: int, radiance: F3
             for light, b in enumerate(radiance):
                 into[light, part] = lobe.rows.matmul(b)
     return out
+
+
+def _curve(parts: Parts, references: References, settings: ErrorSettings) -> list[dict[str, float]]:
+    """Median error over the lights, bytes and frames per second, by tolerance of packing."""
+    probe, found = references.probe, []
+    exact = [probe.to_pixels(parts.exact.to_view(b)[probe.samples]) for b in parts.lights.radiance]
+    for tolerance in settings.tolerances:
+        packed = parts.pack(tolerance)
+        live = LiveRelighter(parts.snapshot, parts.view, parts.gather, packed, parts.lights)
+
+        def recolour(i: int, live: LiveRelighter = live) -> None:
+            parts.lights.set_gain(0, (1 + 0.1 * (i % 7), 1, 0.9))
+            live.frame()
+
+        seconds = repeat(recolour, least=5, seconds=1.0)
+        parts.lights.set_gain(0, (1, 1, 1))
+        total, packing = [], []
+        for light, b in enumerate(parts.lights.radiance):
+            image = probe.to_pixels(packed.to_view(b)[probe.samples])
+            total.append(relative_error(image, references.own_b[0][light], references.own_b[1][light]).rms)
+            packing.append(_difference(image, exact[light], references, light).rms)
+        found.append(
+            {
+                "tolerance": tolerance,
+                "fps": 1 / float(np.median(seconds)),
+                "bytes": float(packed.n_bytes),
+                "total": float(np.median(total)),
+                "packing": float(np.median(packing)),
+                "total_worst": max(total),
+                "packing_worst": max(packing),
+            }
+        )
+    return found
 
 
 def error_edits(parts: Parts) -> dict[str, Edit]:
@@ -292,7 +342,16 @@ def _images(parts: Parts, references: References, names: list[str], folder: Path
 def overview(found: dict[str, Any]) -> dict[str, float]:
     """Median and worst over the lights of several scenes: ``{stage: measure_errors(...)}``."""
     figures: dict[str, float] = {}
-    for kind in ("total", "rest", "transport", "packing", "interpolation", "interpolation_and_packing", "cell_light"):
+    for kind in (
+        "total",
+        "at_rest",
+        "unpacked",
+        "transport",
+        "packing",
+        "interpolation",
+        "interpolation_and_packing",
+        "cell_light",
+    ):
         values = [light[kind]["rms"] for stage in found.values() for light in stage["lights"].values() if kind in light]
         if values:
             figures[f"{kind}_median"] = float(np.median(values))

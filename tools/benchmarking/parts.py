@@ -92,7 +92,21 @@ class Parts:
     @cached_property
     def packed(self) -> Any:
         """What frames multiply with."""
-        return getattr(self._shot, "packed", None) or self._shot.transport
+        shot = getattr(self._shot, "packed", None)
+        return self.pack() if shot is None else shot
+
+    def pack(self, tolerance: float | None = None) -> Any:
+        """The transport packed to a tolerance; None is the preview's own."""
+        from icheat_usd.transport.packing import pack
+
+        options = {} if tolerance is None else {"tolerance": tolerance}
+        return pack(self.exact, self.gather, self._training, **options)
+
+    @cached_property
+    def _training(self) -> F32:
+        from icheat_usd.transport.training import training_radiance
+
+        return training_radiance(self.snapshot, self.tracer, self.gather, self.bounces)
 
     @cached_property
     def lights(self) -> LiveLights:
@@ -103,6 +117,17 @@ class Parts:
         from icheat_usd.relight.live import LiveRelighter
 
         return LiveRelighter(self.snapshot, self.view, self.gather, self.packed, self.lights)
+
+    def shown(self, light: int, *, at_rest: bool) -> F32:
+        """Indirect light of every view sample under one light alone: at once, or when nothing is left to be done."""
+        before = self.lights.gains.copy()
+        self._set_gains(np.repeat(np.eye(len(before), dtype=np.float32)[light][:, None], 3, axis=1))
+        self.live.relit()
+        while at_rest and self.live.refine():
+            pass
+        indirect = self.live.relit().indirect
+        self._set_gains(before)
+        return indirect
 
     def refine_lights(self) -> None:
         """Bring the lights to the quality that they have at rest."""

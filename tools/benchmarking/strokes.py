@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from icheat_usd.edits.model import EditStack, SurfaceMask
@@ -30,11 +28,7 @@ class Stroke:
 
     def dab(self, i: int) -> None:
         """The mask as it is after dab i."""
-        live = self._parts.live
-        edit = self.stack.edits[0]
-        payload = replace(edit.keys[0].payload, receiver_mask=self._masks[i % len(self._masks)])
-        keys = (replace(edit.keys[0], payload=payload),)
-        live.set_stack(replace(self.stack, edits=(replace(edit, keys=keys),)))
+        self._parts.live.dab("/stroke", "receivers", self._masks[i % len(self._masks)])
 
     def _mask(self, i: int) -> SurfaceMask:
         """All dabs up to number i."""
