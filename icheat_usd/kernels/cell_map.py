@@ -34,28 +34,31 @@ class CellTable(NamedTuple):
     candidates: NDArray[np.int32]  #: lists: how many, then samples, ascending
 
 
+# Below, no array is taken from a tuple and no row from an array in a loop over hits: each would count a reference,
+# which made a look-up ten times as slow.
+
+
 @kernel
 def placed_triangle(points, to_world, i, t):  # type: ignore[no-untyped-def]
     """First corner and two edges in world space, double precision."""
     ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
     ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
     fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
-    m = to_world[i]
     return (
         (
-            m[0, 0] * ax + m[0, 1] * ay + m[0, 2] * az + m[0, 3],
-            m[1, 0] * ax + m[1, 1] * ay + m[1, 2] * az + m[1, 3],
-            m[2, 0] * ax + m[2, 1] * ay + m[2, 2] * az + m[2, 3],
+            to_world[i, 0, 0] * ax + to_world[i, 0, 1] * ay + to_world[i, 0, 2] * az + to_world[i, 0, 3],
+            to_world[i, 1, 0] * ax + to_world[i, 1, 1] * ay + to_world[i, 1, 2] * az + to_world[i, 1, 3],
+            to_world[i, 2, 0] * ax + to_world[i, 2, 1] * ay + to_world[i, 2, 2] * az + to_world[i, 2, 3],
         ),
         (
-            m[0, 0] * ex + m[0, 1] * ey + m[0, 2] * ez,
-            m[1, 0] * ex + m[1, 1] * ey + m[1, 2] * ez,
-            m[2, 0] * ex + m[2, 1] * ey + m[2, 2] * ez,
+            to_world[i, 0, 0] * ex + to_world[i, 0, 1] * ey + to_world[i, 0, 2] * ez,
+            to_world[i, 1, 0] * ex + to_world[i, 1, 1] * ey + to_world[i, 1, 2] * ez,
+            to_world[i, 2, 0] * ex + to_world[i, 2, 1] * ey + to_world[i, 2, 2] * ez,
         ),
         (
-            m[0, 0] * fx + m[0, 1] * fy + m[0, 2] * fz,
-            m[1, 0] * fx + m[1, 1] * fy + m[1, 2] * fz,
-            m[2, 0] * fx + m[2, 1] * fy + m[2, 2] * fz,
+            to_world[i, 0, 0] * fx + to_world[i, 0, 1] * fy + to_world[i, 0, 2] * fz,
+            to_world[i, 1, 0] * fx + to_world[i, 1, 1] * fy + to_world[i, 1, 2] * fz,
+            to_world[i, 2, 0] * fx + to_world[i, 2, 1] * fy + to_world[i, 2, 2] * fz,
         ),
     )
 
@@ -67,11 +70,10 @@ def plane_of(points, to_object, i, t):  # type: ignore[no-untyped-def]
     ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
     fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
     gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
-    w = to_object[i]
     return (
-        w[0, 0] * gx + w[1, 0] * gy + w[2, 0] * gz,
-        w[0, 1] * gx + w[1, 1] * gy + w[2, 1] * gz,
-        w[0, 2] * gx + w[1, 2] * gy + w[2, 2] * gz,
+        to_object[i, 0, 0] * gx + to_object[i, 1, 0] * gy + to_object[i, 2, 0] * gz,
+        to_object[i, 0, 1] * gx + to_object[i, 1, 1] * gy + to_object[i, 2, 1] * gz,
+        to_object[i, 0, 2] * gx + to_object[i, 1, 2] * gy + to_object[i, 2, 2] * gz,
     )
 
 
@@ -82,49 +84,51 @@ def place_on(points, to_world, i, t, u, v):  # type: ignore[no-untyped-def]
     ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
     ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
     fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
-    ox, oy, oz = ax + b1 * ex + b2 * fx, ay + b1 * ey + b2 * fy, az + b1 * ez + b2 * fz
-    m = to_world[i]
+    x, y, z = ax + b1 * ex + b2 * fx, ay + b1 * ey + b2 * fy, az + b1 * ez + b2 * fz
     return (
-        np.float32(m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz + m[0, 3]),
-        np.float32(m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz + m[1, 3]),
-        np.float32(m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz + m[2, 3]),
+        np.float32(to_world[i, 0, 0] * x + to_world[i, 0, 1] * y + to_world[i, 0, 2] * z + to_world[i, 0, 3]),
+        np.float32(to_world[i, 1, 0] * x + to_world[i, 1, 1] * y + to_world[i, 1, 2] * z + to_world[i, 1, 3]),
+        np.float32(to_world[i, 2, 0] * x + to_world[i, 2, 1] * y + to_world[i, 2, 2] * z + to_world[i, 2, 3]),
     )
 
 
 @kernel
-def cell_of_hit(cells, locator, points, to_world, to_object, i, t, u, v, dx, dy, dz, stack, bound):  # type: ignore[no-untyped-def]
-    """Gather cell that a ray of direction ``(dx, dy, dz)`` hits; -1 on a degenerate triangle."""
-    px, py, pz = plane_of(points, to_object, i, t)
-    length2 = px * px + py * py + pz * pz
-    if not length2 > 0.0:
-        return np.int64(-1)
-    side = 1 if px * dx + py * dy + pz * dz > 0.0 else 0
-    entry = np.int64(WALK)
-    first = cells.place[i]
-    if first != NO_FACES:
-        f = 2 * (first + t) + side
-        entry = np.int64(cells.face[f, 0])
-        along_u, along_v = cells.face[f, 1], cells.face[f, 2]
-        if along_u > 0:
-            a = min(max(np.int64(u * np.float32(along_u)), 0), np.int64(along_u - 1))
-            b = min(max(np.int64(v * np.float32(along_v)), 0), np.int64(along_v - 1))
-            entry = np.int64(cells.square[entry + b * along_u + a])
-        if entry >= 0:
-            return entry
-    x, y, z = place_on(points, to_world, i, t, u, v)
-    scale = 1.0 / np.sqrt(length2)
+def side_seen(plane, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Side that a ray of direction ``(dx, dy, dz)`` meets; 1 is the back."""
+    return np.int64(1) if plane[0] * dx + plane[1] * dy + plane[2] * dz > 0.0 else np.int64(0)
+
+
+@kernel
+def unit_normal(plane, side):  # type: ignore[no-untyped-def]
+    """Normal of a side from that of the plane."""
+    scale = 1.0 / np.sqrt(plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2])
     if side == 1:
         scale = -scale
-    nx, ny, nz = np.float32(px * scale), np.float32(py * scale), np.float32(pz * scale)
-    if entry == WALK:
-        return nearest_sample(locator, i, side, x, y, z, nx, ny, nz, stack, bound)
-    detour = locator.slot_detour[locator.slot[2 * i + side]]
-    sample = locator.sample
+    return np.float32(plane[0] * scale), np.float32(plane[1] * scale), np.float32(plane[2] * scale)
+
+
+@kernel
+def entry_at(place, face, square, i, t, side, u, v):  # type: ignore[no-untyped-def]
+    """Entry of a place on a triangle."""
+    if place[i] == NO_FACES:
+        return np.int64(WALK)
+    f = 2 * (place[i] + t) + side
+    along_u, along_v = np.int64(face[f, 1]), np.int64(face[f, 2])
+    if along_u == 0:
+        return np.int64(face[f, 0])
+    a = min(max(np.int64(u * np.float32(along_u)), 0), along_u - 1)
+    b = min(max(np.int64(v * np.float32(along_v)), 0), along_v - 1)
+    return np.int64(square[np.int64(face[f, 0]) + b * along_u + a])
+
+
+@kernel
+def nearest_listed(candidates, sample, entry, detour, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """The nearest of the samples that an entry lists, as `nearest_sample` measures it."""
     begin = -entry
-    best = np.int64(cells.candidates[begin])
+    best = np.int64(candidates[begin])
     best_distance = np.float32(np.inf)
-    for e in range(begin, begin + cells.candidates[begin - 1]):
-        j = cells.candidates[e]
+    for e in range(begin, begin + candidates[begin - 1]):
+        j = np.int64(candidates[e])
         ex, ey, ez = sample[j, 0] - x, sample[j, 1] - y, sample[j, 2] - z
         d = ex * ex + ey * ey + ez * ez
         if d < best_distance:
@@ -132,7 +136,7 @@ def cell_of_hit(cells, locator, points, to_world, to_object, i, t, u, v, dx, dy,
                 d += detour
             if d < best_distance:
                 best_distance = d
-                best = np.int64(j)
+                best = j
     return best
 
 
@@ -254,18 +258,14 @@ def find_candidates(  # type: ignore[no-untyped-def]
         count[b, :] = -1
         slot = locator.slot[2 * i + side]
         begin, end = locator.slot_begin[slot], locator.slot_begin[slot + 1]
-        px, py, pz = plane_of(points, to_object, i, t)
-        length2 = px * px + py * py + pz * pz
         if end - begin == 1:
             count[b, 0] = 1
             found[b, 0, 0] = begin
             continue
-        if not length2 > 0.0:
+        plane = plane_of(points, to_object, i, t)
+        if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
             continue
-        scale = 1.0 / np.sqrt(length2)
-        if side == 1:
-            scale = -scale
-        n = (np.float32(px * scale), np.float32(py * scale), np.float32(pz * scale))
+        n = unit_normal(plane, side)
         corner, e, f = placed_triangle(points, to_world, i, t)
         along_u, along_v = divided[block_face[b], 0], divided[block_face[b], 1]
         blocks_u = (along_u + BLOCK - 1) // BLOCK

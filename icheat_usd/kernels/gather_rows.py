@@ -10,8 +10,17 @@ from numba import get_num_threads, prange, types
 from numba.extending import intrinsic
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.cell_map import cell_of_hit
+from icheat_usd.kernels.cell_map import (
+    WALK,
+    entry_at,
+    nearest_listed,
+    place_on,
+    plane_of,
+    side_seen,
+    unit_normal,
+)
 from icheat_usd.kernels.embree import call_1, call_packet
+from icheat_usd.kernels.locate import nearest_sample
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 from icheat_usd.kernels.samples import basis, cosine_direction, cosine_lobe
 from icheat_usd.kernels.sky import octahedral_bin
@@ -151,6 +160,9 @@ def count_hits(  # type: ignore[no-untyped-def]
     n_rows = len(stream)
     together = max(1, BATCH // n_rays)  # rows whose rays are ordered together
     n_lanes = counter.shape[0]
+    mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
+    place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
+    sample, slot, slot_detour = locator.sample, locator.slot, locator.slot_detour
     for lane in prange(n_lanes):
         x, y, z = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
         origin, order = np.empty(BATCH, np.int64), np.empty(BATCH, np.int64)
@@ -218,26 +230,24 @@ def count_hits(  # type: ignore[no-untyped-def]
                                 key[e] = n_cells + octahedral_bin(x[e], y[e], z[e], sky_bins)
                             continue
                         i = np.int64(words[18, k] if words[19, k] == _INVALID else words[19, k])
-                        t = trace.mesh_begin[trace.instance_mesh[i]] + np.int64(words[17, k])
+                        t = mesh_begin[instance_mesh[i]] + np.int64(words[17, k])
                         if triangle_route[t] != 0:
                             key[e] = DETOUR
                             continue
-                        key[e] = cell_of_hit(
-                            cells,
-                            locator,
-                            points,
-                            to_world,
-                            to_object,
-                            i,
-                            t,
-                            rays[15, k],
-                            rays[16, k],
-                            x[e],
-                            y[e],
-                            z[e],
-                            stack,
-                            bound,
-                        )
+                        plane = plane_of(points, to_object, i, t)
+                        if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
+                            continue
+                        side = side_seen(plane, x[e], y[e], z[e])
+                        entry = entry_at(place, face, square, i, t, side, rays[15, k], rays[16, k])
+                        if entry < 0:
+                            px, py, pz = place_on(points, to_world, i, t, rays[15, k], rays[16, k])
+                            nx, ny, nz = unit_normal(plane, side)
+                            if entry == WALK:
+                                entry = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
+                            else:
+                                detour_2 = slot_detour[slot[2 * i + side]]
+                                entry = nearest_listed(candidates, sample, entry, detour_2, px, py, pz, nx, ny, nz)
+                        key[e] = entry
                 done += m
                 for r in range(row_0, row_1):
                     for k in range(m):

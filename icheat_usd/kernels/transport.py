@@ -6,7 +6,16 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import parallel_kernel
-from icheat_usd.kernels.cell_map import cell_of_hit
+from icheat_usd.kernels.cell_map import (
+    WALK,
+    entry_at,
+    nearest_listed,
+    place_on,
+    plane_of,
+    side_seen,
+    unit_normal,
+)
+from icheat_usd.kernels.locate import nearest_sample
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 
 _BLOCK = 2048
@@ -31,6 +40,8 @@ def cells_of_hits(  # type: ignore[no-untyped-def]
 ):
     """Gather cell of every hit, -1 for none; `detour` marks hits on triangles that do not simply reflect."""
     n = len(instance)
+    place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
+    sample, slot, slot_detour = locator.sample, locator.slot, locator.slot_detour
     for block in prange((n + _BLOCK - 1) // _BLOCK):
         stack = np.empty((depth + 1, 2), np.int64)
         bound = np.empty(depth + 1, np.float32)
@@ -43,22 +54,20 @@ def cells_of_hits(  # type: ignore[no-untyped-def]
             if triangle_route[t] != 0:
                 detour[q] = 1
                 continue
-            cell[q] = cell_of_hit(
-                cells,
-                locator,
-                points,
-                to_world,
-                to_object,
-                i,
-                t,
-                u[q],
-                v[q],
-                directions[q, 0],
-                directions[q, 1],
-                directions[q, 2],
-                stack,
-                bound,
-            )
+            plane = plane_of(points, to_object, i, t)
+            if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
+                continue
+            side = side_seen(plane, directions[q, 0], directions[q, 1], directions[q, 2])
+            entry = entry_at(place, face, square, i, t, side, u[q], v[q])
+            if entry < 0:
+                px, py, pz = place_on(points, to_world, i, t, u[q], v[q])
+                nx, ny, nz = unit_normal(plane, side)
+                if entry == WALK:
+                    entry = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
+                else:
+                    detour_2 = slot_detour[slot[2 * i + side]]
+                    entry = nearest_listed(candidates, sample, entry, detour_2, px, py, pz, nx, ny, nz)
+            cell[q] = entry
 
 
 @parallel_kernel
