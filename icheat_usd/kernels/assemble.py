@@ -13,10 +13,11 @@ from icheat_usd.kernels.simd import (
     address_of,
     black,
     color_add,
-    load_color,
+    is_black,
     load_rgb,
     scale_add,
     store_rgb,
+    weighted_sum,
 )
 
 ENTRIES = 4  # of a group
@@ -69,36 +70,54 @@ def _entries(
     return row, weight
 
 
-@kernel
-def _blend(row, weight, products):  # type: ignore[no-untyped-def]
-    """Weighted sum of four products; addresses of the first row, weight and product."""
-    total = black()
-    for k in range(ENTRIES):
-        place = products + 16 * np.int64(row[k])
-        total = scale_add(load_color(place), weight[k], total)
-    return total
+class _Places(NamedTuple):
+    """Addresses and their steps: handed on, arrays would cost more than the work."""
+
+    row: int
+    weight: int
+    products: int
+    tint: int
+    n_lobes: int
+    products_step: int  # from lobe to lobe
+    tint_step: int
 
 
 @kernel
-def _indirect(i, view, row, weight, products, tint, total):  # type: ignore[no-untyped-def]
+def _places(row, weight, products, tint):  # type: ignore[no-untyped-def]
+    return _Places(
+        address_of(row),
+        address_of(weight),
+        address_of(products),
+        address_of(tint),
+        len(products),
+        16 * products.shape[1],
+        12 * tint.shape[1],
+    )
+
+
+@kernel
+def _indirect(at, i, view, total):  # type: ignore[no-untyped-def]
     """`total` plus what group `i` adds to a view sample."""
-    for lobe in range(len(products)):
-        r, g, b = tint[lobe, view, 0], tint[lobe, view, 1], tint[lobe, view, 2]
-        if r != 0.0 or g != 0.0 or b != 0.0:
-            color = load_rgb(address_of(tint) + 12 * (lobe * tint.shape[1] + view))
-            total = color_add(_blend(row[i], weight[i], address_of(products[lobe])), color, total)
+    row, weight, tint = at.row + 16 * i, at.weight + 16 * i, at.tint + 12 * view
+    total = color_add(weighted_sum(at.products, row, weight), load_rgb(tint), total)
+    for lobe in range(1, at.n_lobes):
+        color = load_rgb(tint + lobe * at.tint_step)
+        if not is_black(color):
+            total = color_add(weighted_sum(at.products + lobe * at.products_step, row, weight), color, total)
     return total
 
 
 @kernel
 def _view_chunk(begin, end, row, weight, more_view, more_row, more_weight, products, tint, out):  # type: ignore[no-untyped-def]
     base = address_of(out)
+    at = _places(row, weight, products, tint)
     for v in range(begin, end):
-        store_rgb(base + 12 * v, _indirect(v, v, row, weight, products, tint, black()))
+        store_rgb(base + 12 * v, _indirect(at, v, v, black()))
+    more = _places(more_row, more_weight, products, tint)
     for m in range(np.searchsorted(more_view, begin), np.searchsorted(more_view, end)):
         v = np.int64(more_view[m])
         place = base + 12 * v
-        store_rgb(place, _indirect(m, v, more_row, more_weight, products, tint, load_rgb(place)))
+        store_rgb(place, _indirect(more, m, v, load_rgb(place)))
 
 
 @parallel_kernel
@@ -122,11 +141,10 @@ def assemble_view(row, weight, more_view, more_row, more_weight, products, tint,
 
 
 @kernel
-def _direct(view, direct, gains, total):  # type: ignore[no-untyped-def]
-    """`total` plus the direct light of a view sample."""
-    for light in range(len(direct)):
-        place = address_of(direct) + 12 * (light * direct.shape[1] + view)
-        total = color_add(load_rgb(place), load_rgb(address_of(gains) + 12 * light), total)
+def _direct(direct, step, gains, n_lights, total):  # type: ignore[no-untyped-def]
+    """`total` plus the direct light of a view sample; addresses of the first light's, and from light to light."""
+    for light in range(n_lights):
+        total = color_add(load_rgb(direct + light * step), load_rgb(gains + 12 * light), total)
     return total
 
 
@@ -150,26 +168,26 @@ def _film_chunk(  # type: ignore[no-untyped-def]
     still,
     film,
 ):
-    base = address_of(film)
+    base, factor = address_of(film), address_of(throughput)
+    lit, lit_step, light_gains, n_lights = address_of(direct), 12 * direct.shape[1], address_of(gains), len(direct)
+    weighted = len(throughput) > 0
+    at = _places(row, weight, products, tint)
     for p in range(begin, end):
         total = black()
         for sample in range(sample_begin[p], sample_begin[p + 1]):
             v = np.int64(sample)
-            sent = _direct(v, direct, gains, _indirect(v, v, row, weight, products, tint, black()))
-            if len(throughput) > 0:
-                total = color_add(sent, load_rgb(address_of(throughput) + 12 * v), total)
-            else:
-                total = sent
+            sent = _direct(lit + 12 * v, lit_step, light_gains, n_lights, _indirect(at, v, v, black()))
+            total = color_add(sent, load_rgb(factor + 12 * v), total) if weighted else sent
         store_rgb(base + 12 * p, total)
+    more = _places(more_row, more_weight, products, tint)
     first, last = sample_begin[begin], sample_begin[end]
     for m in range(np.searchsorted(more_view, first), np.searchsorted(more_view, last)):
         v = np.int64(more_view[m])
         place = base + 12 * np.int64(pixel[v])
-        sent = _indirect(m, v, more_row, more_weight, products, tint, black())
-        if len(throughput) > 0:
-            sent = color_add(sent, load_rgb(address_of(throughput) + 12 * v), load_rgb(place))
+        if weighted:
+            sent = color_add(_indirect(more, m, v, black()), load_rgb(factor + 12 * v), load_rgb(place))
         else:
-            sent = scale_add(sent, np.float32(1.0), load_rgb(place))
+            sent = _indirect(more, m, v, load_rgb(place))
         store_rgb(place, sent)
     for s in range(np.searchsorted(still_pixel, begin), np.searchsorted(still_pixel, end)):
         place = base + 12 * np.int64(still_pixel[s])
