@@ -8,29 +8,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
 from icheat_usd.lighting.change import LightError, changed_light, join_lights, new_light, one_light
-from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct
+from icheat_usd.relight.light_work import AnyLight, MovingLight, Surroundings, build_surroundings
+from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
-from icheat_usd.transport import Bounces, CellLight, solve_bounces, sum_lights
-
-_LIVE_SAMPLES = 1  # shadow rays per point and light while something moves
+from icheat_usd.transport import Bounces, CellLight, sum_lights
 
 
 @dataclass
 class _Light:
-    """One light: where it is, and how far its light has been worked out."""
+    """One light, and the work on it that is left: None when it has its final quality."""
 
     alone: SceneSnapshot
-    rest: bool = False  #: whether radiance and direct light have their final quality
+    work: AnyLight | MovingLight | None = None
 
 
 class LiveLights:
     """Light of every light at gathers and view, kept per light so that one light's change costs one light.
 
-    A change shows at once with few samples; `refine` brings it to the quality of `light_cells` and
-    `reflected_direct`. What is reached then depends on the light alone, not on how it got there.
+    A change shows at once, with a shadow ray for every cell and some view samples; `refine` brings it in
+    steps to the quality of `light_cells` and `reflected_direct`. What is reached then depends on the light
+    alone, not on how it got there.
 
     Parameters
     ----------
@@ -53,11 +52,12 @@ class LiveLights:
         dome_samples: int | None = None,
         seed: int = 0,
     ) -> None:
-        self._scene, self._tracer, self._view, self._gather, self._bounces = snapshot, tracer, view, gather, bounces
-        self._n_bounces, self._seed = n_bounces, seed
+        self._scene, self._seed = snapshot, seed
         self._light_samples, self._dome_samples = light_samples, dome_samples
+        self._around: Surroundings = build_surroundings(snapshot, tracer, view, gather, bounces, n_bounces, seed)
         self._lights = [_Light(one_light(snapshot, light)) for light in range(len(snapshot.lights.kind))]
         n = len(self._lights)
+        self.revision = 0  #: grows with everything that changes the light
         self.gains: F32 = np.ones((n, 3), np.float32)  #: (n_lights, 3)
         self.radiance: F32 = np.zeros((n, gather.n, 3), np.float32)  #: (n_lights, n_gather, 3) at gain 1
         self.view_direct: F32 = np.zeros((n, view.n, 3), np.float32)  #: (n_lights, n_view, 3) at gain 1
@@ -90,6 +90,7 @@ class LiveLights:
                 f"the gain of {self.paths[self._checked(light)]} must be finite and not negative, not {rgb!r}"
             )
         self.gains[self._checked(light)] = gain
+        self.revision += 1
 
     def change(
         self,
@@ -127,27 +128,29 @@ class LiveLights:
         alone = new_light(self._scene, path, kind, to_world=to_world, radiance=radiance, size=size, texture=texture)
         self._lights.append(_Light(alone))
         self.gains = np.concatenate([self.gains, np.ones((1, 3), np.float32)])
-        self.radiance = np.concatenate([self.radiance, np.zeros((1, self._gather.n, 3), np.float32)])
-        self.view_direct = np.concatenate([self.view_direct, np.zeros((1, self._view.n, 3), np.float32)])
+        self.radiance = np.concatenate([self.radiance, np.zeros((1, *self.radiance.shape[1:]), np.float32)])
+        self.view_direct = np.concatenate([self.view_direct, np.zeros((1, *self.view_direct.shape[1:]), np.float32)])
         self._show(len(self._lights) - 1)
         return len(self._lights) - 1
 
     def remove(self, light: int) -> None:
         """Take a light away; those behind it move up by one."""
         self._checked(light)
+        self.revision += 1
         del self._lights[light]
         self.gains = np.delete(self.gains, light, axis=0)
         self.radiance = np.delete(self.radiance, light, axis=0)
         self.view_direct = np.delete(self.view_direct, light, axis=0)
 
     def refine(self) -> bool:
-        """Bring one light to its final quality; False when all have it."""
+        """One step, some tens of milliseconds, towards the final quality of a light; False when nothing is left."""
         for light, state in enumerate(self._lights):
-            if not state.rest:
-                self._work_out(light, self._light_samples, self._dome_samples)
-                state.rest = True
+            if state.work is not None:
+                if not state.work.step(self.radiance[light], self.view_direct[light]):
+                    state.work = None
+                self.revision += 1
                 break
-        return not all(state.rest for state in self._lights)
+        return any(state.work is not None for state in self._lights)
 
     def cell_light(self) -> CellLight:
         """What `Relighter` takes, from the present state; its `direct` is not kept and empty."""
@@ -159,18 +162,11 @@ class LiveLights:
         return light
 
     def _show(self, light: int) -> None:
-        self._lights[light].rest = False
-        self._work_out(light, _LIVE_SAMPLES, _LIVE_SAMPLES)
-
-    def _work_out(self, light: int, n_samples: int, dome_samples: int | None) -> None:
-        alone, gather, view = self._lights[light].alone, self._gather, self._view
+        state = self._lights[light]
         # By name, not by number: a light keeps its random numbers when others come or go.
-        seed = (self._seed + zlib.crc32(alone.light_paths[0].encode())) & 0x7FFFFFFF
-        sampler = build_light_sampler(alone, self._tracer, gather.patch_points, seed)
-        direct = cell_direct(alone, self._tracer, sampler, gather, n_samples, seed)
-        self.radiance[light] = solve_bounces(self._bounces, direct, self._n_bounces)[0]
-        sampler = build_light_sampler(alone, self._tracer, view.points, seed)
-        counts = samples_per_light(alone, n_samples, dome_samples)
-        self.view_direct[light] = reflected_direct(
-            alone, self._tracer, sampler, view.points, view.to_eye, seed, counts
-        )[0]
+        seed = (self._seed + zlib.crc32(state.alone.light_paths[0].encode())) & 0x7FFFFFFF
+        counts = self._light_samples, self._dome_samples
+        kind = MovingLight if self._around.can_move(state.alone) else AnyLight
+        state.work = kind(self._around, state.alone, seed, *counts)
+        state.work.show(self.radiance[light], self.view_direct[light])
+        self.revision += 1

@@ -269,6 +269,11 @@ class EmbreeTracer:
             self._instance_mesh,
         )
 
+    def occluded_function(self) -> tuple[int, int]:
+        """Addresses of ``rtcOccluded16`` and of the scene, for compiled loops that make shadow rays themselves."""
+        self._require_open()
+        return _address("rtcOccluded16"), self._scene
+
     def _require_open(self) -> None:
         if not self._scene:
             raise ValueError("this tracer was closed")

@@ -1,0 +1,121 @@
+"""Lights as tables of points spread evenly over them."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from icheat_usd.kernels.random import sobol_pair
+from icheat_usd.scene import F32, F64, LightKind, SceneSnapshot
+
+N_POINTS = 256  # shadows of a light have so many steps
+
+
+def has_points(kind: int) -> bool:
+    """Whether a light can be a table of points: every kind but domes and meshes."""
+    return kind not in (LightKind.DOME, LightKind.MESH)
+
+
+@functools.lru_cache(maxsize=64)
+def _numbers(seed: int) -> F64:
+    return np.array([sobol_pair(k, seed) for k in range(N_POINTS)], np.float64)
+
+
+def light_points(snapshot: SceneSnapshot, seed: int) -> tuple[F32, bool]:
+    """Points of the one light of a snapshot.
+
+    Returns
+    -------
+    table : (N_POINTS, 12) float32
+        Place, unit normal of the side that shines, radiance times the area that all points stand for; a distant
+        light has directions, and radiance times solid angle (without an angle its radiance is an irradiance).
+    distant : bool
+    """
+    lights = snapshot.lights
+    kind = LightKind(int(lights.kind[0]))
+    linear, origin = lights.to_world[0, :, :3].astype(np.float64), lights.to_world[0, :, 3].astype(np.float64)
+    a, b = (float(size) for size in lights.size[0])
+    u = _numbers(seed & 0xFFFFFFFF)
+    color: F64 = np.ones((N_POINTS, 3))
+    if kind == LightKind.DISTANT:
+        place, area = _cone(linear, a, u)
+        normal = np.zeros_like(place)
+    elif kind in (LightKind.RECT, LightKind.DISK):
+        flat = (u - 0.5) * (a, b) if kind == LightKind.RECT else _disk(u) * a
+        place = origin + flat @ linear[:, :2].T
+        across = np.cross(linear[:, 0], linear[:, 1])
+        scale = float(np.linalg.norm(across))
+        # the third axis decides the side, so that a mirrored light still shines where its own -Z went
+        side = 1.0 if across @ linear[:, 2] < 0.0 else -1.0
+        normal = np.broadcast_to(side * across / max(scale, 1e-300), place.shape)
+        area = np.full(N_POINTS, scale * (a * b if kind == LightKind.RECT else np.pi * a * a))
+        if kind == LightKind.RECT and lights.texture[0] >= 0:
+            color = _image(snapshot, 1.0 - u)
+    else:
+        local, outward, measure = _sphere(a, u) if kind == LightKind.SPHERE else _cylinder(a, b, u)
+        place = origin + local @ linear.T
+        # an area element with normal n becomes one along cofactor(M) n, larger by that vector's length
+        x, y, z = linear
+        turned = outward @ np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)]).T
+        turned *= np.sign(np.linalg.det(linear))
+        length = np.linalg.norm(turned, axis=1)
+        normal = turned / np.maximum(length, 1e-300)[:, None]
+        area = measure * length
+    table = np.zeros((N_POINTS, 12), np.float32)
+    table[:, :3], table[:, 3:6] = place, normal
+    table[:, 6:9] = color * lights.radiance[0] * area[:, None]
+    return table, kind == LightKind.DISTANT
+
+
+def _cone(linear: F64, angle: float, u: F64) -> tuple[F64, F64]:
+    axis = linear[:, 2] / max(float(np.linalg.norm(linear[:, 2])), 1e-300)
+    if angle <= 0.0:
+        return np.broadcast_to(axis, (N_POINTS, 3)), np.ones(N_POINTS)
+    span = 2.0 * np.sin(0.5 * angle) ** 2
+    c = u[:, 0] * span
+    r, phi = np.sqrt(np.maximum(0.0, c * (2.0 - c))), 2.0 * np.pi * u[:, 1]
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    side = np.cross(axis, helper)
+    side /= np.linalg.norm(side)
+    local = np.stack([r * np.cos(phi), r * np.sin(phi), 1.0 - c], 1)
+    return local @ np.stack([side, np.cross(axis, side), axis]), np.full(N_POINTS, 2.0 * np.pi * span)
+
+
+def _disk(u: F64) -> F64:
+    """Concentric map of the unit square to the unit disk (Shirley & Chiu 1997)."""
+    a, b = 2.0 * u.T - 1.0
+    wide = np.abs(a) > np.abs(b)
+    r = np.where(wide, a, b)
+    ratio = np.where(wide, b, a) / np.where(r == 0.0, 1.0, r)
+    phi = np.where(wide, np.pi / 4.0 * ratio, np.pi / 2.0 - np.pi / 4.0 * ratio)
+    return np.stack([r * np.cos(phi), r * np.sin(phi)], 1)
+
+
+def _sphere(radius: float, u: F64) -> tuple[F64, F64, float]:
+    z, phi = 1.0 - 2.0 * u[:, 0], 2.0 * np.pi * u[:, 1]
+    r = np.sqrt(np.maximum(0.0, 1.0 - z * z))
+    outward = np.stack([r * np.cos(phi), r * np.sin(phi), z], 1)
+    return outward * radius, outward, 4.0 * np.pi * radius * radius
+
+
+def _cylinder(radius: float, length: float, u: F64) -> tuple[F64, F64, float]:
+    phi = 2.0 * np.pi * u[:, 1]
+    outward = np.stack([0.0 * phi, np.cos(phi), np.sin(phi)], 1)
+    local = outward * radius + (u[:, :1] - 0.5) * np.array([length, 0.0, 0.0])
+    return local, outward, 2.0 * np.pi * radius * length
+
+
+def _image(snapshot: SceneSnapshot, st: F64) -> F64:
+    """Bilinear lookup of the light's image, clamped at its edges."""
+    textures, row = snapshot.textures, int(snapshot.lights.texture[0])
+    begin, width, height = int(textures.begin[row]), int(textures.width[row]), int(textures.height[row])
+    image = textures.texels[begin : begin + width * height, :3].reshape(height, width, 3)
+    x, y = st[:, 0] * width - 0.5, st[:, 1] * height - 0.5
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    result = np.zeros((len(st), 3))
+    for dy, wy in ((0, 1.0 - (y - y0)), (1, y - y0)):
+        for dx, wx in ((0, 1.0 - (x - x0)), (1, x - x0)):
+            texel = image[np.clip(y0 + dy, 0, height - 1), np.clip(x0 + dx, 0, width - 1)]
+            result += (wx * wy)[:, None] * np.where(np.isfinite(texel), texel, 0.0)
+    return result

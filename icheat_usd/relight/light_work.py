@@ -1,0 +1,229 @@
+"""The work on one light of a view: a first look at once, then step by step up to its final quality."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.rows import mean_over_segments
+from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct, samples_per_light
+from icheat_usd.lighting.points import has_points
+from icheat_usd.lighting.quick import Places, Shadows, build_shadows, direct_at, prepare_places
+from icheat_usd.lighting.sampler import LightSampler
+from icheat_usd.materials import effective_albedo, is_glossy, take_points
+from icheat_usd.samples import GatherSamples, ViewSamples
+from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.tracing import Tracer
+from icheat_usd.tracing.embree import EmbreeTracer
+from icheat_usd.transport import Bounces, solve_bounces
+from icheat_usd.transport.quick_bounces import QuickBounces, build_quick_bounces
+
+# Smoother lobes are found by rays of their own at rest: points of the light miss them.
+_SMOOTH = 0.3
+
+_RAYS_PER_STEP = 1 << 16  # of the general way
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What every light of a view shines on; made once."""
+
+    snapshot: SceneSnapshot
+    tracer: Tracer
+    view: ViewSamples
+    gather: GatherSamples
+    bounces: Bounces
+    n_bounces: int
+    patch_tint: F32  #: (n_patches, 3) effective albedo over pi
+    quick_bounces: QuickBounces | None  #: None for a single bounce
+    shadows: Shadows | None  #: None: the tracer can't be called from compiled loops
+    cells: Places | None  #: one patch point of each cell
+    patches: Places | None
+    tiles: Places | None  #: view samples in the order of tiles of 8 x 8 pixels
+    smooth: I64  #: view samples with narrow lobes
+
+    def can_move(self, alone: SceneSnapshot) -> bool:
+        """Whether the light of a one-light snapshot has the quick way."""
+        return self.shadows is not None and has_points(int(alone.lights.kind[0]))
+
+    def all_bounces(self, direct: F32) -> F32:
+        """Light that leaves the cells, quickly."""
+        return direct if self.quick_bounces is None else self.quick_bounces.solve(direct)
+
+    def cell_means(self, of_patches: F32) -> F32:
+        """Means over the patch points of each cell."""
+        out = np.empty((self.gather.n, 3), np.float32)
+        mean_over_segments(self.gather.cell_begin, of_patches, out)
+        return out
+
+
+def build_surroundings(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    view: ViewSamples,
+    gather: GatherSamples,
+    bounces: Bounces,
+    n_bounces: int,
+    seed: int,
+) -> Surroundings:
+    """Prepare the places where lights shine."""
+    albedo = effective_albedo(gather.patch_points)
+    shadows = cells = patches = tiles = None
+    if isinstance(tracer, EmbreeTracer):
+        shadows = build_shadows(snapshot, tracer)
+        patches = prepare_places(snapshot, gather.patch_points, albedo, None)
+        count = np.diff(gather.cell_begin)
+        chosen = np.random.default_rng(seed).integers(0, count) + gather.cell_begin[:-1]
+        cells = Places(None, patches.place[chosen], patches.tint[chosen], patches.gloss)
+        tiles = prepare_places(snapshot, view.points, view.points.albedo, view.to_eye, _tile_order(view))
+    return Surroundings(
+        snapshot,
+        tracer,
+        view,
+        gather,
+        bounces,
+        n_bounces,
+        albedo / np.float32(np.pi),
+        build_quick_bounces(bounces, gather.tree, n_bounces) if n_bounces > 1 else None,
+        shadows,
+        cells,
+        patches,
+        tiles,
+        np.flatnonzero(is_glossy(view.points) & (view.points.roughness < _SMOOTH)),
+    )
+
+
+def _tile_order(view: ViewSamples) -> I64:
+    """View samples by tiles of 8 x 8 pixels, within them by quarters of quarters."""
+    y, x = np.divmod(view.pixel.astype(np.int64), view.width)
+    key = (y // 8 * (view.width // 8 + 1) + x // 8) * 64
+    for bit in range(3):
+        key += ((x >> bit & 1) << (2 * bit)) + ((y >> bit & 1) << (2 * bit + 1))
+    return np.argsort(key, kind="stable")
+
+
+class MovingLight:
+    """A light with a surface of its own, or a distant one: rounds of one shadow ray per patch point and view sample."""
+
+    def __init__(
+        self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
+    ) -> None:
+        self._around, self._alone, self._seed, self._rounds = around, alone, seed, light_samples
+        self._step = 0
+        self._cells = np.zeros((around.gather.n, 3), np.float32)
+        self._view = np.zeros((around.view.n, 3), np.float32)
+
+    def show(self, radiance: F32, view_direct: F32) -> None:
+        """First look: a shadow ray per cell, and where neighbours disagree one per view sample."""
+        around = self._around
+        assert around.shadows is not None and around.cells is not None and around.tiles is not None
+        direct = np.empty((around.gather.n, 3), np.float32)
+        direct_at(self._alone, around.shadows, around.cells, self._seed, False, direct)
+        radiance[:] = around.all_bounces(direct)
+        direct_at(self._alone, around.shadows, around.tiles, self._seed, True, view_direct)
+
+    def step(self, radiance: F32, view_direct: F32) -> bool:
+        """Another round at the cells or at the view; False after the last."""
+        around = self._around
+        assert around.shadows is not None and around.patches is not None and around.tiles is not None
+        turn, at_view = divmod(self._step, 2)
+        self._step += 1
+        if turn == self._rounds:
+            radiance[:] = solve_bounces(around.bounces, (self._cells / np.float32(turn))[None], around.n_bounces)[0]
+            self._find_highlights(view_direct)
+            return False
+        seed = int(hash_combine(self._seed, turn))
+        places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
+        found = np.empty((len(places.place), 3), np.float32)
+        direct_at(self._alone, around.shadows, places, seed, False, found)
+        into += found if at_view else around.cell_means(found)
+        share = np.float32(1.0 / (turn + 1))
+        if at_view:
+            np.multiply(into, share, out=view_direct)
+        else:
+            radiance[:] = around.all_bounces(into * share)
+        return True
+
+    def _find_highlights(self, view_direct: F32) -> None:
+        view, rows = self._around.view, self._around.smooth
+        if len(rows):
+            points = take_points(view.points, rows)
+            sampler = build_light_sampler(self._alone)
+            view_direct[rows] = reflected_direct(
+                self._alone, self._around.tracer, sampler, points, view.to_eye[rows], self._seed, self._rounds
+            )[0]
+
+
+class AnyLight:
+    """Any kind of light, the general way: part after part of the cells and of the view, shown when all are done."""
+
+    def __init__(
+        self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
+    ) -> None:
+        self._around, self._alone, self._seed = around, alone, seed
+        self._n_cells = light_samples
+        self._n_view = samples_per_light(alone, light_samples, dome_samples)[0]
+        self._samplers: list[LightSampler] = []
+        self._cell = self._sample = 0
+        self._cells = np.zeros((around.gather.n, 3), np.float32)
+        self._view = np.zeros((around.view.n, 3), np.float32)
+
+    def show(self, radiance: F32, view_direct: F32) -> None:
+        """First look: one shadow ray per cell and view sample."""
+        around = self._around
+        patch = around.gather.cell_begin[:-1]
+        points = take_points(around.gather.patch_points, patch)
+        arriving = irradiance(self._alone, around.tracer, self._sampler(0), points, self._seed, 1)[0]
+        radiance[:] = around.all_bounces(arriving * around.patch_tint[patch])
+        view_direct[:] = reflected_direct(
+            self._alone, around.tracer, self._sampler(1), around.view.points, around.view.to_eye, self._seed, 1
+        )[0]
+
+    def step(self, radiance: F32, view_direct: F32) -> bool:
+        """The next part of the cells, then of the view; False after the last."""
+        around = self._around
+        if self._cell < around.gather.n:
+            self._light_cells()
+            if self._cell == around.gather.n:
+                radiance[:] = solve_bounces(around.bounces, self._cells[None], around.n_bounces)[0]
+            return True
+        if self._sample < around.view.n:
+            self._light_view()
+        if self._sample < around.view.n:
+            return True
+        view_direct[:] = self._view
+        return False
+
+    def _sampler(self, which: int) -> LightSampler:
+        """Of the cells (0) and of the view (1), learnt when first needed."""
+        while len(self._samplers) <= which:
+            around = self._around
+            points = around.view.points if self._samplers else around.gather.patch_points
+            self._samplers.append(build_light_sampler(self._alone, around.tracer, points, self._seed))
+        return self._samplers[which]
+
+    def _light_cells(self) -> None:
+        around, begin = self._around, self._around.gather.cell_begin
+        first = self._cell
+        wanted = int(begin[first]) + max(1, _RAYS_PER_STEP // self._n_cells)
+        last = min(max(int(np.searchsorted(begin, wanted)), first + 1), around.gather.n)
+        patches = np.arange(begin[first], begin[last])
+        points = take_points(around.gather.patch_points, patches)
+        seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
+        arriving = irradiance(self._alone, around.tracer, self._sampler(0), points, seed, self._n_cells)[0]
+        mean_over_segments(
+            begin[first : last + 1] - begin[first], arriving * around.patch_tint[patches], self._cells[first:last]
+        )
+        self._cell = last
+
+    def _light_view(self) -> None:
+        around, first = self._around, self._sample
+        last = min(first + max(1, _RAYS_PER_STEP // self._n_view), around.view.n)
+        points = take_points(around.view.points, slice(first, last))
+        seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
+        self._view[first:last] = reflected_direct(
+            self._alone, around.tracer, self._sampler(1), points, around.view.to_eye[first:last], seed, self._n_view
+        )[0]
+        self._sample = last
