@@ -21,7 +21,7 @@ _MAX_RATIO = 64.0
 
 @kernel
 def adjust_hsv(color, numbers, scale, emission):  # type: ignore[no-untyped-def]
-    """Scale and emission that turn hue, saturation and value of one colour; as `operations.hsv`, in double precision."""
+    """Scale and emission that turn hue, saturation and value of one colour; see `operations.hsv`."""
     r, g, b = max(color[0], 0.0), max(color[1], 0.0), max(color[2], 0.0)
     v = max(r, g, b)
     chroma = v - min(r, g, b)
@@ -155,6 +155,8 @@ def _piece_deltas(
     set_sign,
     sets,
     version_restrict,
+    run_of,
+    looks,
     cell_begin,
     entry_row,
     entry_weight,
@@ -176,7 +178,9 @@ def _piece_deltas(
     reach = version_restrict[version, 2]
     n_groups = len(b)
     found = np.empty((n_groups, 4, 3))
+    total_found = np.zeros((n_groups, 4, 3))
     value = np.empty(3)
+    known = -1
     edit = row_table[restrict, 0] if restrict >= 0 else 0
     whole = True
     for g in range(n_groups):
@@ -193,36 +197,45 @@ def _piece_deltas(
             for entry in range(first, end):
                 if entry_row[entry] == restrict:
                     share = np.float64(entry_weight[entry])
-        value[:] = share if reach != 0 else 0.0
-        if reach == 0:
-            for s in range(version_sets[version], version_sets[version + 1]):
-                weight = set_sign[s] * share
-                compose(
-                    sets[s],
-                    first,
-                    end,
-                    entry_row,
-                    entry_weight,
-                    entry_slot,
-                    slots,
-                    row_table,
-                    row_amount,
-                    groups,
-                    b,
-                    cell,
-                    found,
-                )
-                for c in range(3):
-                    light = found[0, 1, c] if whole else 0.0
+        if reach != 0:
+            value[:] = share
+        else:
+            # Neighbours on one surface mostly have the same coefficients.
+            if run_of[cell] != known or looks[cell] != 0:
+                known = run_of[cell]
+                total_found[:] = 0.0
+                for s in range(version_sets[version], version_sets[version + 1]):
+                    compose(
+                        sets[s],
+                        first,
+                        end,
+                        entry_row,
+                        entry_weight,
+                        entry_slot,
+                        slots,
+                        row_table,
+                        row_amount,
+                        groups,
+                        b,
+                        cell,
+                        found,
+                    )
                     for g in range(n_groups):
-                        if restrict >= 0 and groups[edit, g] == 0:
-                            continue
-                        scale = found[g, 0, c] - 1.0 if unedited != 0 else found[g, 0, c]
-                        light += scale * b[g, cell, c]
-                        radiance = weight * area[cell] * b[g, cell, c]
-                        total[c] += found[g, 2, c] * radiance
-                        total[3 + c] += found[g, 3, c] * radiance
-                    value[c] += weight * light
+                        for c in range(3):
+                            scale = found[g, 0, c] - 1.0 if unedited != 0 else found[g, 0, c]
+                            total_found[g, 0, c] += set_sign[s] * scale
+                            for kind in range(1, 4):
+                                total_found[g, kind, c] += set_sign[s] * found[g, kind, c]
+            for c in range(3):
+                light = total_found[0, 1, c] if whole else 0.0
+                for g in range(n_groups):
+                    if restrict >= 0 and groups[edit, g] == 0:
+                        continue
+                    light += total_found[g, 0, c] * b[g, cell, c]
+                    radiance = share * area[cell] * b[g, cell, c]
+                    total[c] += total_found[g, 2, c] * radiance
+                    total[3 + c] += total_found[g, 3, c] * radiance
+                value[c] = share * light
         for c in range(3):
             deltas[k, c] = value[c]
 
@@ -235,6 +248,29 @@ def _concerned(row_changed, entry_row, first, end):  # type: ignore[no-untyped-d
     return False
 
 
+@kernel
+def find_runs(cell_begin, entry_row, entry_weight, entry_slot, row_table, run_of, looks):  # type: ignore[no-untyped-def]
+    """Number runs of cells that the same rows act on alike; mark cells that a row acts on which looks at light."""
+    run = 0
+    for cell in range(len(run_of)):
+        first, end = cell_begin[cell], cell_begin[cell + 1]
+        same = cell > 0 and first - cell_begin[cell - 1] == end - first
+        looks[cell] = 0
+        for k in range(first, end):
+            if row_table[entry_row[k], 1] == HSV:
+                looks[cell] = 1
+            if same:
+                other = k - (end - first)
+                same = (
+                    entry_row[k] == entry_row[other]
+                    and entry_weight[k] == entry_weight[other]
+                    and entry_slot[k] == entry_slot[other]
+                )
+        if not same:
+            run += 1
+        run_of[cell] = run
+
+
 @parallel_kernel
 def version_deltas(
     pieces,
@@ -243,6 +279,8 @@ def version_deltas(
     set_sign,
     sets,
     version_restrict,
+    run_of,
+    looks,
     cell_begin,
     entry_row,
     entry_weight,
@@ -269,6 +307,8 @@ def version_deltas(
     version_restrict : (n_versions, 3) int64
         Row whose casters and lights alone count, or -1; 1 to subtract the unedited light; 1 for the casters'
         weights instead of light.
+    run_of, looks : (n_gather,)
+        Cells of one number that follow each other are acted on alike, unless an edit looks at their light.
     cells, deltas : (n_cells,), (n_cells, 3)
     offsets : (n, 6) float64
     """
@@ -280,6 +320,8 @@ def version_deltas(
             set_sign,
             sets,
             version_restrict,
+            run_of,
+            looks,
             cell_begin,
             entry_row,
             entry_weight,
@@ -416,10 +458,9 @@ def _multiply_pair(first, end, index, scale, value, coefficients, out):  # type:
 
 
 @parallel_kernel
-def multiply_pairs(tile_begin, index, scale, value, coefficients, pairs, pair_tile, pair_version, out):  # type: ignore[no-untyped-def]
-    """``out[p] = tile @ coefficients[version]`` for some pairs p; coefficients of 0 cost nothing."""
-    for k in prange(len(pairs)):
-        p = pairs[k]
+def multiply_pairs(tile_begin, index, scale, value, coefficients, pair_tile, pair_version, out):  # type: ignore[no-untyped-def]
+    """``out[p] = tile @ coefficients[version]`` for pairs p; coefficients of 0 cost nothing."""
+    for p in prange(len(pair_tile)):
         tile = pair_tile[p]
         _multiply_pair(
             tile_begin[tile], tile_begin[tile + 1], index, scale, value, coefficients[pair_version[p]], out[p]
@@ -427,11 +468,10 @@ def multiply_pairs(tile_begin, index, scale, value, coefficients, pairs, pair_ti
 
 
 @parallel_kernel
-def multiply_sparse_pairs(indptr, indices, weights, leaves, pairs, pair_tile, pair_version, out):  # type: ignore[no-untyped-def]
+def multiply_sparse_pairs(indptr, indices, weights, leaves, pair_tile, pair_version, out):  # type: ignore[no-untyped-def]
     """As `multiply_pairs` for 64 rows at once of a sparse matrix and values of leaves (n_slots, n_leaves, 4)."""
     n_rows = len(indptr) - 1
-    for k in prange(len(pairs)):
-        p = pairs[k]
+    for p in prange(len(pair_tile)):
         first = pair_tile[p] * 64
         version = pair_version[p]
         for lane in range(64):
@@ -448,6 +488,48 @@ def multiply_sparse_pairs(indptr, indices, weights, leaves, pairs, pair_tile, pa
             out[p, lane, 0] = red
             out[p, lane, 1] = green
             out[p, lane, 2] = blue
+
+
+@parallel_kernel
+def sum_products(tile, group, term_begin, term_version, pair_of, values, n_tiles, sums):  # type: ignore[no-untyped-def]
+    """Products of a group's terms on top of a tile's unedited ones.
+
+    Parameters
+    ----------
+    tile, group : (n,) of each sum
+    pair_of : (n_versions, n_tiles) row of `values` (n_lobes, n_pairs, 64, 4)
+    sums : (n_lobes, n_tiles + n, 64, 4) the unedited products come first
+    """
+    n = len(tile)
+    for job in prange(n * len(sums)):
+        lobe, k = job // n, job % n
+        _sum_terms(
+            sums[lobe, tile[k]],
+            term_version[term_begin[group[k]] : term_begin[group[k] + 1]],
+            pair_of[:, tile[k]],
+            values[lobe],
+            sums[lobe, n_tiles + k],
+        )
+
+
+@kernel
+def _sum_terms(unedited, versions, pair_of, values, out):  # type: ignore[no-untyped-def]
+    for lane in range(64):
+        for c in range(3):
+            out[lane, c] = unedited[lane, c]
+    for version in versions:
+        pair = pair_of[version]
+        for lane in range(64):
+            for c in range(3):
+                out[lane, c] += values[pair, lane, c]
+
+
+@parallel_kernel
+def clamp_samples(samples, light):  # type: ignore[no-untyped-def]
+    """Hold some rows of `light` at 0 or above."""
+    for k in prange(len(samples)):
+        for c in range(3):
+            light[samples[k], c] = max(light[samples[k], c], np.float32(0))
 
 
 @kernel

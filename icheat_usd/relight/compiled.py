@@ -51,6 +51,8 @@ class CompiledStack:
     slot_begin: I64  #: (n_rows + 1,) those of each row: one, or one for each cell of its support
     support: Bool  #: (n_rows, n_gather) cells on surfaces that the casters may lie on, painted or not
     together: Bool  #: (n_signatures, n_rows) rows that occur together at some cell
+    run_of: I32  #: (n_gather,) see `kernels.versions.version_deltas`
+    looks_at: U8  #: (n_gather,)
     _entries: dict[int, I64] = dataclasses.field(default_factory=dict)
 
     @property
@@ -82,6 +84,19 @@ class CompiledStack:
         rank = np.cumsum(there) - 1
         inside = there[cells]
         self.entry_weight[self._entries[row][rank[cells[inside]]]] = weights[inside]
+        self.find_runs()
+
+    def find_runs(self) -> None:
+        """Find which neighbouring cells are acted on alike."""
+        kernels.find_runs(
+            self.cell_begin,
+            self.entry_row,
+            self.entry_weight,
+            self.entry_slot,
+            self.row_table,
+            self.run_of,
+            self.looks_at,
+        )
 
 
 def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) -> CompiledStack:
@@ -114,7 +129,7 @@ def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) ->
     cell, row_of = cell[order], row_of[order]
     begin = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=gather.n))]).astype(np.int64)
     edit_of = np.concatenate([table[:, 0], table[aggregates, 0]]).astype(np.int64)
-    return CompiledStack(
+    compiled = CompiledStack(
         field,
         way,
         edit_of,
@@ -130,7 +145,11 @@ def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) ->
         slot_begin,
         support,
         np.unique(on_instances[:, np.unique(instance[instance >= 0])].T, axis=0),
+        np.zeros(gather.n, np.int32),
+        np.zeros(gather.n, np.uint8),
     )
+    compiled.find_runs()
+    return compiled
 
 
 def _way(bound: BoundEdit) -> Way:

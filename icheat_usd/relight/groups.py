@@ -38,6 +38,7 @@ class GroupTerms(NamedTuple):
     light: tuple[Term, ...] = ()
     seen: tuple[tuple[int, tuple[Term, ...]], ...] = ()  #: by row of each aggregate, in order: the light that it sees
     alone: bool = False
+    view: bool = False  #: something acts on all their light at the end
 
 
 class TermTable(NamedTuple):
@@ -70,7 +71,7 @@ def group_terms(compiled: CompiledStack, whole: Sequence[int], soft: Sequence[in
         seen.append((row, terms))
     if max([len(light), *(len(terms) for _, terms in seen)]) > MOST_TERMS:
         return GroupTerms(alone=True)
-    return GroupTerms(light, tuple(seen))
+    return GroupTerms(light, tuple(seen), view=any(way[row] == Way.VIEW for row in (*whole, *soft)))
 
 
 def _order(compiled: CompiledStack):  # type: ignore[no-untyped-def]

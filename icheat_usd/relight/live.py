@@ -19,6 +19,7 @@ from icheat_usd.relight.groups import SampleGroups, TermTable
 from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.relighter import RelitView
+from icheat_usd.relight.shared_light import SharedLight
 from icheat_usd.relight.term_tables import TermTables
 from icheat_usd.relight.versions import Versions
 from icheat_usd.samples import GatherSamples, ViewSamples
@@ -78,6 +79,7 @@ class LiveRelighter:
         self._direct: F32 = np.zeros((view.n, 3), np.float32)
         self._base: F32 = np.zeros((view.n, 3), np.float32)
         self._edited: F32 = np.zeros((view.n, 3), np.float32)
+        self._own: F32 = np.zeros((view.n, 3), np.float32)  # of samples that do not share their light with a group
         self._lights_seen: Any = None
         self._light_stale = True
         self._stack = LiveStack(snapshot, view, gather)
@@ -248,6 +250,7 @@ class LiveRelighter:
         self._groups = SampleGroups(stack.compiled, self.view.n)
         self._versions = Versions(stack.compiled, self._products, self.gather.area)
         self._terms = TermTables(stack.compiled, self._groups, self._versions)
+        self._shared = SharedLight(self._products, self.view.n)
         self._changed_rows: set[int] = set()
         self._changed_samples: list[I64] = []
         self._samples_of: dict[frozenset[int], tuple[I64, I64]] = {}
@@ -274,6 +277,8 @@ class LiveRelighter:
                 needed,
             )
         self._versions.need(needed)
+        self._shared.place(samples, groups, np.append(self._terms.shared, False))
+        self._mixed: Bool = ~np.append(self._terms.shared, True)[groups.of_sample]
         self._alone: Bool = np.append(self._terms.alone, False)[groups.of_sample]
         samples = np.flatnonzero(self._alone)
         self._alone_samples: AloneSamples | None = None
@@ -287,6 +292,8 @@ class LiveRelighter:
         """Which samples the edits that are not muted touch; the others keep their unedited light, bit for bit."""
         self._active_rows = self._stack.active_rows
         self._touched = self._touched_by(self._active_rows)
+        self._mixed_samples = np.flatnonzero(self._mixed)
+        self._shared_samples = np.flatnonzero(self._touched & ~self._mixed)
 
     def _touched_by(self, rows: Iterable[int]) -> Bool:
         found = np.zeros(self.view.n, np.bool_)
@@ -322,14 +329,15 @@ class LiveRelighter:
         if self._light_stale:
             b = np.ascontiguousarray(self.lights.total(), np.float32)
             self._direct = np.ascontiguousarray(self.lights.direct(), np.float32)
-            self._base = self.transport.to_view(b)
-            self._edited = self._base.copy()
             self._by_group = self._light_by_group(b)
+            self._shared.set_unedited(b)
+            self._shared.unedited(self._base)
             self._versions.light_changed(self._by_group)
-            samples, pixels = np.flatnonzero(self._touched), self._all_pixels
+            samples, pixels = self._mixed_samples, self._all_pixels
         else:
             samples, pixels = self._changed_places()
         self._versions.update()
+        self._shared.edited(self._terms.light, self._versions, self._edited)
         self._edit(samples)
         self._light_stale = False
         self._changed_rows, self._changed_samples = set(), []
@@ -355,20 +363,24 @@ class LiveRelighter:
         return sum_groups(self.lights.radiance * self.lights.gains[:, None, :], field.light_group, field.n_groups)
 
     def _edit(self, samples: I64) -> None:
-        """Find the edited light of some samples."""
+        """Find the light of those of some samples that do not share theirs, and hold all edited light at 0 or above."""
+        samples = samples[self._mixed[samples]]
         idle = samples[~self._touched[samples]]
-        self._edited[idle] = self._base[idle]
-        samples = samples[self._touched[samples]]
+        self._own[idle] = self._base[idle]
+        self._edit_mixed(samples[self._touched[samples]])
+        self._edited[self._mixed_samples] = np.take(self._own, self._mixed_samples, axis=0)
+        kernels.clamp_samples(self._shared_samples, self._edited)
+
+    def _edit_mixed(self, samples: I64) -> None:
         if not len(samples):
             return
         light = np.take(self._base, samples, axis=0)
         self._add(self._terms.light, samples, self._aggregate_factors(samples), light)
-        if self._alone_samples is not None:
-            if self._alone[samples].any():
-                difference = self._alone_samples.difference(self._stack.field, self.gather, self._by_group)
-                self._alone_difference[self._alone] = difference
+        if self._alone_samples is not None and self._alone[samples].any():
+            difference = self._alone_samples.difference(self._stack.field, self.gather, self._by_group)
+            self._alone_difference[self._alone] = difference
             light += self._alone_difference[samples]
-        self._edited[samples] = self._stack.field.finish(light, self._view_ends(samples))
+        self._own[samples] = self._stack.field.finish(light, self._view_ends(samples))
 
     def _add(self, terms: TermTable, samples: I64, own: F32, out: F32) -> None:
         self._terms.add(terms, samples, self._stack.receiver_masks, own, self._products, self._albedo, out)

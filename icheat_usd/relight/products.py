@@ -7,10 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels.packed import multiply_paired_tiles, pair_coefficients
 from icheat_usd.samples import ClusterTree
+from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
 from icheat_usd.scene import F32, F64, I32, I64, U8
 from icheat_usd.transport import SparseRows, Transport
 from icheat_usd.transport.packed import LANES, PackedTransport
+
+#: Versions with more cells than this are transformed as a whole, by all cores.
+_MANY_CELLS = 4096
 
 
 class VersionTables(NamedTuple):
@@ -49,6 +54,13 @@ class Products:
         if self._haar:
             self._parent_of_leaf, self._parent = _parents(tree)
             self._share, self._root = _shares(tree)
+            self._plan = plan_haar(tree)
+            self._paired = [
+                pair_coefficients(rows.tile_begin, rows.index, rows.scale, rows.value)
+                if rows.value.dtype == np.int8
+                else None
+                for rows in self._rows
+            ]
 
     def room(self, n_pairs: int) -> F32:
         """Place for products, (n_lobes, n_pairs, 64, 4)."""
@@ -79,42 +91,61 @@ class Products:
 
     def prepare(self, versions: I64, tables: VersionTables, deltas: F32) -> None:
         """Bring the differences of some versions into the basis of the rows."""
-        if self._haar:
-            kernels.haar_of_cells(
-                versions,
-                tables.cell_begin,
-                deltas,
-                tables.node_begin,
-                tables.nodes,
-                tables.child,
-                self._share,
-                self._root,
-                self._versions,
-            )
-        else:
+        if not self._haar:
             kernels.spread_cells(versions, tables.cell_begin, tables.cells, deltas, self._versions)
+            return
+        large = np.diff(tables.cell_begin)[versions] > _MANY_CELLS
+        kernels.haar_of_cells(
+            versions[~large],
+            tables.cell_begin,
+            deltas,
+            tables.node_begin,
+            tables.nodes,
+            tables.child,
+            self._share,
+            self._root,
+            self._versions,
+        )
+        for version in versions[large]:
+            some = slice(tables.cell_begin[version], tables.cell_begin[version + 1])
+            values = np.zeros((1, self._n_leaves, 3), np.float32)
+            values[0, tables.cells[some]] = deltas[some]
+            haar_of_versions(self._plan, values, self._versions[version : version + 1])
 
     def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32) -> None:
         """Products of some pairs of tile and version into ``out[:, pairs]``."""
         if not len(pairs):
             return
-        for lobe, rows in enumerate(self._rows):
-            if self._haar:
-                kernels.multiply_pairs(
-                    rows.tile_begin,
-                    rows.index,
-                    rows.scale,
-                    rows.value,
-                    self._versions,
-                    pairs,
-                    pair_tile,
-                    pair_version,
-                    out[lobe],
-                )
-            else:
-                kernels.multiply_sparse_pairs(
-                    rows.indptr, rows.indices, rows.weights, self._versions, pairs, pair_tile, pair_version, out[lobe]
-                )
+        tile, version = pair_tile[pairs], pair_version[pairs]
+        direct = len(pairs) == pairs[-1] - pairs[0] + 1 and bool((np.diff(pairs) == 1).all())
+        part = slice(pairs[0], pairs[-1] + 1)
+        for lobe in range(len(self._rows)):
+            into = out[lobe, part] if direct else np.empty((len(pairs), LANES, 4), np.float32)
+            self._multiply(lobe, self._versions, tile, version, into)
+            if not direct:
+                out[lobe, pairs] = into
+
+    def multiply_all(self, b: F32, out: F32) -> None:
+        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``."""
+        if self._haar:
+            values = haar_of_versions(self._plan, b[None])
+        else:
+            values = np.zeros((1, self._n_leaves, 4), np.float32)
+            values[0, :, :3] = b
+        tile = np.arange(self.n_tiles, dtype=np.int32)
+        for lobe in range(len(self._rows)):
+            self._multiply(lobe, values, tile, np.zeros_like(tile), out[lobe, : self.n_tiles])
+
+    def _multiply(self, lobe: int, versions: F32, tile: I32, version: I32, out: F32) -> None:
+        rows = self._rows[lobe]
+        if not self._haar:
+            kernels.multiply_sparse_pairs(rows.indptr, rows.indices, rows.weights, versions, tile, version, out)
+            return
+        paired = self._paired[lobe]
+        if paired is None:
+            kernels.multiply_pairs(rows.tile_begin, rows.index, rows.scale, rows.value, versions, tile, version, out)
+            return
+        multiply_paired_tiles(paired.tile_begin, paired.index, paired.scale, paired.value, versions, tile, version, out)
 
 
 def _n_entries(rows: Any) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.relight.compiled import CompiledStack, Way
-from icheat_usd.relight.groups import SampleGroups, Term, TermTable
+from icheat_usd.relight.groups import GroupTerms, SampleGroups, Term, TermTable
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.versions import VersionKey, Versions
 from icheat_usd.scene import F32, I64, Bool
@@ -24,6 +24,7 @@ class TermTables:
         self.seen: list[TermTable] = []  #: by aggregate
         self.reach: list[TermTable] = []  #: by aggregate
         self.alone: Bool = np.zeros(0, np.bool_)  #: (n_groups,) evaluated pair by pair
+        self.shared: Bool = np.zeros(0, np.bool_)  #: (n_groups,) the same for all samples, but for the interpolation
 
     @property
     def steps(self) -> list[TermTable]:
@@ -32,7 +33,9 @@ class TermTables:
     def arrange(self) -> None:
         """Make the tables for the groups that there are now."""
         groups = self._groups.terms
-        self.alone = np.array([terms.alone for terms in groups] or [False], np.bool_)
+        self.alone = np.array([terms.alone for terms in groups], np.bool_)
+        offsets = self._compiled.field.has_offset
+        self.shared = np.array([not offsets and _is_shared(terms) for terms in groups], np.bool_)
         self.light = self._table([terms.light for terms in groups])
         seen: list[dict[int, tuple[Term, ...]]] = [dict(terms.seen) for terms in groups]
         self.seen = [self._table([terms.get(int(row), ()) for terms in seen]) for row in self.aggregates]
@@ -88,6 +91,10 @@ class TermTables:
         if self._compiled.way[member] == Way.AGGREGATE:
             return n_rows + 2 * int(np.searchsorted(self.aggregates, member))
         return member
+
+
+def _is_shared(terms: GroupTerms) -> bool:
+    return not (terms.alone or terms.view or terms.seen or any(term.factors for term in terms.light))
 
 
 _EMPTY = TermTable(np.zeros(2, np.int64), np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32))

@@ -126,6 +126,8 @@ class Versions:
             tables.sign,
             tables.sets,
             tables.restrict,
+            compiled.run_of,
+            compiled.looks_at,
             compiled.cell_begin,
             compiled.entry_row,
             compiled.entry_weight,

@@ -1,0 +1,106 @@
+"""The image as one interpolation of products: unedited ones, and for groups touched wholly, their edited light."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels.assemble import InterpolationTable, assemble_view, interpolation_table
+from icheat_usd.relight.groups import SampleGroups, TermTable
+from icheat_usd.relight.products import Products
+from icheat_usd.relight.versions import Versions
+from icheat_usd.scene import F32, I32, I64, Bool
+from icheat_usd.transport.packed import LANES
+
+
+class SharedLight:
+    """Sums of products by group and tile, for groups whose samples all receive the same terms.
+
+    The table that the edited image is interpolated with names these sums
+    instead of the unedited products, so that an edit costs a pixel nothing.
+    """
+
+    def __init__(self, products: Products, n_view: int) -> None:
+        self._products = products
+        spread = products.interpolation
+        if products.is_sparse:
+            self._base = interpolation_table(spread.indptr, spread.indices, spread.weights)
+        else:
+            row = np.arange(n_view, dtype=np.int32)
+            self._base = interpolation_table(np.arange(n_view + 1, dtype=np.int64), row, np.ones(n_view, np.float32))
+        base = self._base
+        self._edited = base._replace(row=base.row.copy(), more_row=base.more_row.copy())
+        self._of: I32 = np.zeros((0, products.n_tiles), np.int32)
+        self._tile: I32 = np.zeros(0, np.int32)
+        self._group: I32 = np.zeros(0, np.int32)
+        #: (n_lobes, n_tiles + n_sums, 64, 4) unedited products, then the sums
+        self._sums: F32 = products.room(products.n_tiles)
+
+    def place(self, samples: I64, groups: SampleGroups, shared: Bool) -> None:
+        """Let the table name what some samples share; `shared` (n_groups + 1,) says which groups do."""
+        base, edited = self._base, self._edited
+        of = groups.of_sample
+        grown = np.full((len(shared) - 1 - len(self._of), self._of.shape[1]), -1, np.int32)
+        self._of = np.concatenate([self._of, grown])
+        more = _entries_of(base.more_view, samples)
+        for view, row, out, which in (
+            (samples, base.row, edited.row, samples),
+            (base.more_view[more].astype(np.int64), base.more_row, edited.more_row, more),
+        ):
+            group = of[view]
+            moved = shared[group]
+            out[which[~moved]] = row[which[~moved]]
+            there = row[which[moved]]
+            group = np.repeat(group[moved, None], there.shape[1], axis=1)
+            tile, lane = there // LANES, there % LANES
+            self._ask(group, tile)
+            out[which[moved]] = (self._products.n_tiles + self._of[group, tile]) * LANES + lane
+
+    def _ask(self, group: I32, tile: I32) -> None:
+        flags = np.zeros(self._of.shape, np.bool_)
+        flags[group, tile] = True
+        new_group, new_tile = np.nonzero(flags & (self._of < 0))
+        if not len(new_group):
+            return
+        self._of[new_group, new_tile] = len(self._tile) + np.arange(len(new_group), dtype=np.int32)
+        self._tile = np.concatenate([self._tile, new_tile.astype(np.int32)])
+        self._group = np.concatenate([self._group, new_group.astype(np.int32)])
+        sums = self._products.room(self._products.n_tiles + len(self._tile))
+        sums[:, : self._sums.shape[1]] = self._sums
+        self._sums = sums
+
+    def set_unedited(self, b: F32) -> None:
+        """Multiply the transport with the unedited light (n_gather, 3)."""
+        self._products.multiply_all(b, self._sums)
+
+    def unedited(self, out: F32) -> None:
+        """Unedited indirect light of all view samples into `out`."""
+        self._assemble(self._base, out)
+
+    def edited(self, terms: TermTable, versions: Versions, out: F32) -> None:
+        """Light of all view samples into `out`: edited where a group shares it, else unedited."""
+        if len(self._tile):
+            kernels.sum_products(
+                self._tile,
+                self._group,
+                terms.term_begin,
+                terms.term_version,
+                versions.pair_of,
+                versions.values,
+                self._products.n_tiles,
+                self._sums,
+            )
+        self._assemble(self._edited, out)
+
+    def _assemble(self, table: InterpolationTable, out: F32) -> None:
+        sums = self._sums
+        assemble_view(*table, sums.reshape(len(sums), -1, 4), self._products.tints, out)
+
+
+def _entries_of(view: I32, samples: I64) -> I64:
+    """Places in `view`, ascending with repetitions, that belong to some samples, ascending."""
+    begin, end = np.searchsorted(view, samples), np.searchsorted(view, samples, side="right")
+    counts = end - begin
+    return np.asarray(
+        np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(begin, counts)
+    )
