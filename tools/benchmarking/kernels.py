@@ -6,10 +6,13 @@ meets all of them; figures are medians and quartiles over the rounds.
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -189,9 +192,17 @@ def _scipy_peers(matrix: SparseRows, b: F32, label: str) -> dict[tuple[str, int]
     }
 
 
+def _find_mkl() -> None:
+    """Point sparse_dot_mkl to the library that pip installs, with the OpenMP that Numba uses as well."""
+    os.environ.setdefault("MKL_THREADING_LAYER", "GNU")
+    for library in sorted((Path(sys.prefix) / "lib").glob("libmkl_rt.so*")):
+        os.environ.setdefault("MKL_RT", str(library))
+
+
 def _mkl_peers(matrix: SparseRows, b: F32, label: str) -> dict[tuple[str, int], tuple[Work, int]]:
     """MKL's product with three columns; nothing where it is not installed."""
     try:
+        _find_mkl()
         import sparse_dot_mkl
         from scipy.sparse import csr_matrix
     except (ImportError, OSError):
@@ -201,7 +212,7 @@ def _mkl_peers(matrix: SparseRows, b: F32, label: str) -> dict[tuple[str, int], 
 
     def product(threads: int) -> None:
         sparse_dot_mkl.mkl_set_num_threads(threads)
-        sparse_dot_mkl.dot_product_mkl(whole, b, out=out)
+        sparse_dot_mkl.dot_product_mkl(whole, b, out=out, out_scalar=0.0)
 
     return {
         (f"MKL {label}, dense (m, 3)", threads): (lambda threads=threads: product(threads), matrix.n_entries * 8)
