@@ -36,7 +36,9 @@ class ShotKeys:
     view: str
     gather: str
     bounces: str
+    training: str
     transport: str
+    packed: str
     lights: str  #: the lights alone
     cell_light: str
     view_light: str
@@ -60,17 +62,23 @@ def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKey
     lights, domes = (_lights(snapshot, only) for only in (None, LightKind.DOME))
     gather = digest("gather", sight, quality.n_gather)
     bounces = digest("bounces", gather, quality.rays_per_bounce_row)
-    transport = digest("transport", gather, *_transport_settings(quality))
+    training = digest("training", bounces)
+    # Records stand where light that bounces would show them.
+    rows = gather if quality.record_error is None else training
+    transport = digest("transport", rows, *_transport_settings(quality))
+    packed = digest("packed", transport, training, quality.packing_error)
     cell_light = digest("cell light", bounces, lights, quality.n_bounces, quality.light_samples)
     view_light = digest("view light", sight, lights, quality.light_samples, quality.dome_samples)
     view = digest("view", sight, domes)  # the sky behind the scene is part of the view
-    return ShotKeys(scene, view, gather, bounces, transport, lights, cell_light, view_light)
+    return ShotKeys(scene, view, gather, bounces, training, transport, packed, lights, cell_light, view_light)
 
 
 def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     """All settings but those that other keys hold, or that come after the transport."""
     elsewhere = {"n_gather", "rays_per_bounce_row", "light_samples", "dome_samples", "n_bounces", "samples_per_pixel"}
-    return tuple((name, value) for name, value in asdict(quality).items() if name not in elsewhere)
+    unused = {"record_rays"} if quality.record_error is None else {"rays_per_row", "row_spacing"}
+    without = elsewhere | unused | {"packing_error"}
+    return tuple((name, value) for name, value in asdict(quality).items() if name not in without)
 
 
 def _lights(snapshot: SceneSnapshot, kind: LightKind | None) -> str:

@@ -27,7 +27,7 @@ class Evaluator:
     Not for two threads at once. The same state has the same image, whatever came before.
     """
 
-    def __init__(self, parts: ShotParts, transport: Transport | PackedTransport, n_light_samples: int) -> None:
+    def __init__(self, parts: ShotParts, transport: Transport | PackedTransport) -> None:
         quality = parts.quality
         self._snapshot = parts.snapshot
         self.view = parts.view
@@ -38,7 +38,7 @@ class Evaluator:
             parts.gather,
             parts.bounces,
             n_bounces=quality.n_bounces,
-            light_samples=n_light_samples,
+            light_samples=quality.light_samples,
             dome_samples=quality.dome_samples,
             seed=quality.seed,
         )

@@ -35,13 +35,17 @@ class SharedParts:
 
     def get(self, kind: str, key: str, make: Callable[[], Part]) -> Part:
         """The part of this key, made if it is not there."""
+        found = self.find(kind, key)
+        return cast(Part, found) if found is not None else self.keep(kind, key, make())
+
+    def find(self, kind: str, key: str) -> Any | None:
         with self._lock:
-            found = self._parts.get((kind, key))
-        if found is not None:
-            return cast(Part, found)
-        made = make()
+            return self._parts.get((kind, key))
+
+    def keep(self, kind: str, key: str, part: Part) -> Part:
+        """The part, or the one that was there first."""
         with self._lock:
-            return cast(Part, self._parts.setdefault((kind, key), made))
+            return cast(Part, self._parts.setdefault((kind, key), part))
 
     def __len__(self) -> int:
         return len(self._parts)

@@ -428,7 +428,17 @@ class LiveSession:
     # Time -------------------------------------------------------------------------------------------------------------
 
     def scrub(self, frame: float | None) -> bool:
-        """Put the playhead at a frame; whether it can be shown without waiting."""
+        """Put the playhead at a frame; whether it can be shown without waiting.
+
+        Raises
+        ------
+        EditError
+            It is no time.
+        """
+        if frame is not None:
+            if not isinstance(frame, (int, float)) or not np.isfinite(frame):
+                raise EditError(f"{frame!r} is no frame, such as 24 or 12.5")
+            frame = float(frame)
         return self._frames.scrub(frame)
 
     def play(self, frames: Sequence[float], *, level: Level | str = Level.PREVIEW) -> Iterator[tuple[float, F32]]:

@@ -25,6 +25,8 @@ from icheat_usd.session.live_state import UNCHANGED, LiveState
 from icheat_usd.session.quality import coarse
 from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.stage.edit_stack import read_edit_stack
+from icheat_usd.transport import Transport
+from icheat_usd.transport.packed import PackedTransport
 
 
 class Level(StrEnum):
@@ -244,31 +246,45 @@ class LiveFrames:
         began = time.perf_counter()
         parts = self._parts(number, level)
         with self._background.lock:
-            state, entry = self.state, self.resident.get(number)
+            entry = self.resident.get(number)
         frame = LiveFrame(parts.snapshot) if entry is None else entry
-        stack = self._read_stack(parts.snapshot)
-        evaluator, is_new = self._evaluator(parts)
-        if is_new:
-            # Without the lock: lights that were changed are worked out here.
-            evaluator.show(stack, state)
+        key = digest(_keys_of_image(parts), parts.snapshot.centre)
+        evaluator = self._shared.find("evaluator", key)
+        if evaluator is None:
+            for transport in parts.transports():
+                if evaluator is None:
+                    evaluator = self._evaluator(parts, transport)
+                    self._show(
+                        number,
+                        frame,
+                        evaluator,
+                        frame.level if frame.level.reaches(Level.PREVIEW) else Level.PREVIEW,
+                        began,
+                    )
+                    continue
+                with self._background.lock:
+                    evaluator.relighter.set_transport(transport)
+                self._tell(LiveEvent("better", number, frame.level))
+            assert evaluator is not None
+            self._shared.keep("evaluator", key, evaluator)
+        self._show(number, frame, evaluator, level, began)
+        self._building.pop((number, level), None)
+
+    def _evaluator(self, parts: ShotParts, transport: Transport | PackedTransport) -> Evaluator:
+        """At the state already: without the lock, as lights that were changed are worked out here."""
+        with self._background.lock:
+            state = self.state
+        evaluator = Evaluator(parts, transport)
+        evaluator.show(self._read_stack(parts.snapshot), state)
+        return evaluator
+
+    def _show(self, number: float | None, frame: LiveFrame, evaluator: Evaluator, level: Level, began: float) -> None:
+        """Have a frame shown by something better."""
         with self._background.lock:
             evaluator.show(self.stack_of(frame), self.state)
             frame.evaluator, frame.level = evaluator, level
             self.resident.put(number, frame, time.perf_counter() - began)
-        self._building.pop((number, level), None)
         self._tell(LiveEvent("better", number, level))
-
-    def _evaluator(self, parts: ShotParts) -> tuple[Evaluator, bool]:
-        """One for all frames that look the same but for their edits; whether it was made now."""
-        keys = parts.keys
-        key = digest(keys.transport, keys.view, keys.cell_light, keys.view_light, parts.snapshot.centre)
-        made: list[Evaluator] = []
-
-        def make() -> Evaluator:
-            made.append(Evaluator(parts, parts.transport, parts.quality.light_samples))
-            return made[0]
-
-        return self._shared.get("evaluator", key, make), bool(made)
 
     def _parts(self, number: float | None, level: Level) -> ShotParts:
         """The parts of a frame at a level; those that are done are kept when another job is more urgent."""
@@ -329,3 +345,9 @@ class LiveFrames:
         self._background.notify()
         for listener in tuple(self._listeners):
             listener(event)
+
+
+def _keys_of_image(parts: ShotParts) -> tuple[str, ...]:
+    """Of everything that an evaluator shows but the edits: frames that agree in these share one."""
+    keys = parts.keys
+    return keys.packed, keys.view, keys.cell_light, keys.view_light

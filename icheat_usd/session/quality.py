@@ -18,6 +18,10 @@ class Quality:
     rays_per_row: int = 256
     rays_per_bounce_row: int = 128
     row_spacing: int = 1  #: pixels between the points where rows are kept; the rest is interpolated
+    record_error: float | None = None  #: relative RMS error that rows kept where they are needed, instead of on a grid,
+    #: may add by interpolation; None keeps them on the grid of `row_spacing`
+    record_rays: int = 2048  #: gather rays of each such row
+    packing_error: float | None = None  #: relative RMS error that packed rows may add; None keeps them exact
     light_samples: int = 16  #: shadow rays per light and point
     dome_samples: int | None = None  #: for the direct light of domes in the image; 4 `light_samples` by default
     n_bounces: int = 16  #: diffuse reflections before the last one
@@ -29,6 +33,15 @@ class Quality:
 DRAFT = Quality(n_gather=8_192, rays_per_row=64, rays_per_bounce_row=64, row_spacing=4, light_samples=8)
 
 PREVIEW = Quality()
+
+#: Rows at few points, with many rays each: faster to make than `PREVIEW`, and less noisy.
+RECORDS = replace(PREVIEW, record_error=0.01)
+
+#: The same, packed so that a frame takes milliseconds.
+LIVE = replace(RECORDS, packing_error=0.015)
+
+#: For a close look at what lives on: half the errors.
+LIVE_FINE = replace(PREVIEW, record_error=0.005, record_rays=4096, packing_error=0.0075)
 FINAL = GatherSettings()
 
 
@@ -40,6 +53,8 @@ def coarse(quality: Quality) -> Quality:
         rays_per_row=min(quality.rays_per_row, 64),
         rays_per_bounce_row=min(quality.rays_per_bounce_row, 32),
         row_spacing=max(quality.row_spacing, 8),
+        record_error=None,
+        packing_error=None,
         light_samples=min(quality.light_samples, 2),
         dome_samples=min(quality.dome_samples or 4, 4),
         samples_per_pixel=1,

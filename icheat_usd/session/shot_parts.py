@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, Protocol, TypeVar, cast
 
@@ -17,6 +18,11 @@ from icheat_usd.session.disk_cache import DiskCache, Shelf
 from icheat_usd.session.quality import Quality
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import Bounces, CellLight, HeldBack, Transport, build_bounces, build_transport, light_cells
+from icheat_usd.transport.packed import PackedTransport
+from icheat_usd.transport.packing import pack
+from icheat_usd.transport.progressive import build_transports
+from icheat_usd.transport.records import RecordSettings
+from icheat_usd.transport.training import training_radiance
 
 Part = TypeVar("Part")
 
@@ -95,10 +101,55 @@ class ShotParts:
         return self._kept("gather", ("view",), make)
 
     @cached_property
+    def training(self) -> F32:
+        """What plausible lights make leave the gather samples: what rows and coefficients are chosen by."""
+
+        def make(_: Shelf | None) -> F32:
+            self.progress("try plausible lights", 0.0)
+            return training_radiance(self.snapshot, self.tracer, self.gather, self.bounces, seed=self.quality.seed)
+
+        return self._kept("training", ("bounces",), make)
+
+    @cached_property
     def transport(self) -> Transport:
+        """Exact rows, at all view samples or at records."""
+
         def make(_: Shelf | None) -> Transport:
-            quality = self.quality
-            return build_transport(
+            return deque(self._measured(), maxlen=1).pop()
+
+        needs = ("gather",) if self.quality.record_error is None else ("training",)
+        return self._kept("transport", needs, make)
+
+    @cached_property
+    def packed(self) -> PackedTransport:
+        """The transport in few bytes; the error of that is a setting."""
+        error = self.quality.packing_error
+        if error is None:
+            raise ValueError("this quality asks for exact rows; give it a packing_error")
+
+        def make(_: Shelf | None) -> PackedTransport:
+            return pack(self.transport, self.gather, self.training, error, progress=self.progress)
+
+        return self._kept("packed", ("transport", "training"), make)
+
+    def transports(self) -> Iterator[Transport | PackedTransport]:
+        """Better and better ones, each usable; the last is what the quality asks for."""
+        is_packed = self.quality.packing_error is not None
+        if "transport" not in self.__dict__ and not self._is_on_disk("packed" if is_packed else "transport"):
+            last: Transport | None = None
+            for last in self._measured():
+                yield last
+            assert last is not None
+            self.__dict__["transport"] = last
+            self._keep("transport", last)
+            if not is_packed:
+                return
+        yield self.packed if is_packed else self.transport
+
+    def _measured(self) -> Iterator[Transport]:
+        quality = self.quality
+        if quality.record_error is None:
+            yield build_transport(
                 self.snapshot,
                 self.tracer,
                 self.view,
@@ -108,8 +159,18 @@ class ShotParts:
                 seed=quality.seed,
                 progress=self.progress,
             )
-
-        return self._kept("transport", ("gather",), make)
+            return
+        yield from build_transports(
+            self.snapshot,
+            self.tracer,
+            self.view,
+            self.gather,
+            self.training,
+            settings=RecordSettings(tolerance=quality.record_error),
+            rays_per_row=quality.record_rays,
+            seed=quality.seed,
+            progress=self.progress,
+        )
 
     @cached_property
     def bounces(self) -> Bounces:
@@ -174,7 +235,7 @@ class ShotParts:
     def _from_disk(self, kind: str, needs: Sequence[str], make: Callable[[Shelf | None], Part]) -> Part:
         if not self._disk.is_on:
             return make(None)
-        shelf = self._disk.shelf(kind, getattr(self.keys, kind), self._about())
+        shelf = self._shelf(kind)
         found = shelf.load("whole")
         if found is not None:
             return cast(Part, found)
@@ -187,6 +248,16 @@ class ShotParts:
             shelf.save("whole", made)
             shelf.drop(*(name for name in shelf.names() if name != "whole"))
         return made
+
+    def _shelf(self, kind: str) -> Shelf:
+        return self._disk.shelf(kind, getattr(self.keys, kind), self._about())
+
+    def _is_on_disk(self, kind: str) -> bool:
+        return self._disk.is_on and "whole" in self._shelf(kind).names()
+
+    def _keep(self, kind: str, part: Any) -> None:
+        if self._disk.is_on:
+            self._shelf(kind).save("whole", part)
 
     def _about(self) -> dict[str, Any]:
         """For people who look at the cache."""

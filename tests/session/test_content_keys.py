@@ -75,12 +75,15 @@ def test_geometry_materials_and_the_tracer_are_in_every_key_but_the_lights() -> 
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("rays_per_row", 64, {"transport"}),
-        ("row_spacing", 4, {"transport"}),
+        ("rays_per_row", 64, {"transport", "packed"}),
+        ("row_spacing", 4, {"transport", "packed"}),
+        ("record_error", 0.1, {"transport", "packed"}),
+        ("record_rays", 64, set()),  # without records
+        ("packing_error", 0.1, {"packed"}),
         ("n_bounces", 2, {"cell_light"}),
-        ("rays_per_bounce_row", 16, {"bounces", "cell_light"}),
+        ("rays_per_bounce_row", 16, {"bounces", "cell_light", "training", "packed"}),
         ("dome_samples", 3, {"view_light"}),
-        ("n_gather", 64, {"gather", "bounces", "transport", "cell_light"}),
+        ("n_gather", 64, {"gather", "bounces", "training", "transport", "packed", "cell_light"}),
         ("seed", 1, ALL - {"scene", "lights"}),
     ],
 )
