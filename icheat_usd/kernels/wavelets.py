@@ -145,31 +145,3 @@ def haar_of_sparse_row(mid, left, right, weight, node_weight, leaves, values, st
             stack[depth, 0], stack[depth, 1], stack[depth, 2] = left[node], begin, split
             depth += 1
     return count
-
-
-@parallel_kernel
-def haar_top_k(  # type: ignore[no-untyped-def]
-    mid, left, right, weight, node_weight, tree_depth, indptr, indices, values, k, counts, out_index, out_value
-):
-    """The `k` coefficients of largest magnitude of every sparse row, ascending by index; ties keep the lower index."""
-    for r in prange(len(indptr) - 1):
-        leaves = indices[indptr[r] : indptr[r + 1]]
-        stack = np.empty((tree_depth + 2, 3), np.int64)
-        bound = min(len(weight), 1 + len(leaves) * (tree_depth + 1))
-        index = np.empty(bound, np.int32)
-        value = np.empty(bound, np.float64)
-        n = haar_of_sparse_row(
-            mid, left, right, weight, node_weight, leaves, values[indptr[r] : indptr[r + 1]], stack, index, value
-        )
-        if n > k:
-            order = np.argsort(-np.abs(value[:n]), kind="mergesort")[:k]
-            order.sort()
-            for e in range(k):
-                out_index[r, e] = index[order[e]]
-                out_value[r, e] = value[order[e]]
-            counts[r] = k
-        else:
-            for e in range(n):
-                out_index[r, e] = index[e]
-                out_value[r, e] = value[e]
-            counts[r] = n

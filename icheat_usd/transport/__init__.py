@@ -10,22 +10,28 @@ from icheat_usd.transport.bounces import (
     sum_lights,
 )
 from icheat_usd.transport.build import Lobe, Transport, build_transport
-from icheat_usd.transport.compress import CompressedRows, compress_rows
 from icheat_usd.transport.held_back import HeldBack
+from icheat_usd.transport.packed import PackedLobe, PackedRows, PackedTransport, PackingReport
+from icheat_usd.transport.packing import lossless, pack, residual
 from icheat_usd.transport.sparse import SparseRows
 
 __all__ = [
     "Bounces",
     "CellLight",
-    "CompressedRows",
     "HeldBack",
     "Lobe",
+    "PackedLobe",
+    "PackedRows",
+    "PackedTransport",
+    "PackingReport",
     "SparseRows",
     "Transport",
     "build_bounces",
     "build_transport",
-    "compress_rows",
     "light_cells",
+    "lossless",
+    "pack",
+    "residual",
     "solve_bounces",
     "sum_groups",
     "sum_lights",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from icheat_usd.kernels import packing as kernels
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_forward
-from icheat_usd.scene import F32, I32, I64
+from icheat_usd.scene import F32, F64, I32, I64, Bool
 from icheat_usd.transport.build import Transport
 from icheat_usd.transport.sparse import SparseRows
 
@@ -33,7 +33,7 @@ class PackedRows:
     tree: ClusterTree
     n_rows: int
     tile_begin: I64  #: (n_tiles + 1,) first coefficient of each tile
-    index: I32  #: (n,) coefficient, ascending within a tile
+    index: I32  #: (n,) coefficient, ascending within a tile; what rounding left of it may follow as a second entry
     scale: F32  #: (n,) value of one quantum
     value: NDArray[np.int8] | F32  #: (n, 64) quanta, one column per row of the tile; 0 beyond the last row
 
@@ -70,6 +70,17 @@ class PackedRows:
         kernels.multiply_tiles(self.tile_begin, self.index, self.scale, self.value, coefficients, out)
         return out[: self.n_rows]
 
+    def keep(self, kept: Bool) -> PackedRows:
+        """Without the entries that are not marked in `kept` (n,)."""
+        count = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
+        return replace(
+            self,
+            tile_begin=count[self.tile_begin],
+            index=self.index[kept],
+            scale=self.scale[kept],
+            value=self.value[kept],
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class PackedLobe:
@@ -80,14 +91,32 @@ class PackedLobe:
     tint: F32  #: (n_view, 3) multiplies the interpolated product
 
 
+@dataclass(frozen=True)
+class PackingReport:
+    """What packing was measured to lose at the records, as the pixels weight them, with lights it did not know."""
+
+    light_error: F64  #: (n_lights,) relative RMS of each training light, for tiles packed by others
+
+    @property
+    def error(self) -> float:
+        """RMS over the lights."""
+        return float(np.sqrt(np.mean(self.light_error**2))) if len(self.light_error) else 0.0
+
+    @property
+    def worst(self) -> float:
+        """Of any light."""
+        return float(self.light_error.max(initial=0.0))
+
+
 @dataclass(frozen=True, eq=False)
 class PackedTransport:
-    """A `Transport` whose rows are packed; rows beyond interpolation are the only thing that is lost."""
+    """A `Transport` with packed rows; otherwise the same."""
 
     lobes: tuple[PackedLobe, ...]
     row_view: I32  #: (n_rows,) the view sample that each row was computed at
     interpolation: SparseRows | None  #: (n_view x n_rows); None where rows are view samples
     source: Transport | None = None  #: the exact rows, while there is memory for them
+    report: PackingReport | None = None
 
     @property
     def n_bytes(self) -> int:
@@ -113,3 +142,34 @@ class PackedTransport:
                 product = lobe.rows.multiply(coefficients)
                 out += lobe.tint * (product if self.interpolation is None else self.interpolation.matmul(product))
         return out
+
+    def narrowed(self, coefficients: F32, max_bytes: int) -> PackedTransport:
+        """Only what adds most to products with some lights, for frames that keep to these lights.
+
+        Parameters
+        ----------
+        coefficients : (n_leaves,)
+            Largest size that each Haar coefficient of the light will have.
+        max_bytes
+            Of the tiles together.
+
+        Notes
+        -----
+        Which coefficients matter to a light depends on the light: for one that
+        is known, an eighth of them serves as well as all. `residual` of the result
+        tells what is lost of a light.
+        """
+        worth = []
+        for lobe in self.lobes:
+            tint = np.sqrt(np.mean(np.square(lobe.tint), dtype=np.float64))
+            size = np.take(coefficients, lobe.rows.index) * lobe.rows.scale * np.float32(tint)
+            worth.append(np.where(lobe.rows.index == 0, np.float32(np.inf), size))
+        n_kept = max_bytes // (LANES + 8)
+        every = np.concatenate(worth)
+        if n_kept >= len(every):
+            return self
+        least = np.partition(every, len(every) - n_kept)[len(every) - n_kept] if n_kept > 0 else np.inf
+        lobes = [
+            replace(lobe, rows=lobe.rows.keep(size >= least)) for lobe, size in zip(self.lobes, worth, strict=True)
+        ]
+        return replace(self, lobes=tuple(lobes))

@@ -1,4 +1,4 @@
-"""Sparse products and their compressed twin against dense ones."""
+"""Sparse products against dense ones."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.samples.tree import build_tree, split_samples
-from icheat_usd.transport import SparseRows, compress_rows
+from icheat_usd.transport import SparseRows
 from icheat_usd.transport.sparse import concatenate_rows
 
 
@@ -51,24 +50,3 @@ def test_parts_of_a_matrix_stack_up_to_it_again() -> None:
     assert np.array_equal(again.indptr, rows.indptr)
     assert np.array_equal(again.indices, rows.indices)
     assert np.array_equal(again.weights, rows.weights)
-
-
-def test_compression_is_exact_with_all_coefficients_and_better_with_more() -> None:
-    rng = np.random.default_rng(4)
-    n = 130
-    position = rng.random((n, 3)).astype(np.float32)
-    begin = np.array([0, 50, n], np.int64)
-    shape = split_samples([("a",), ("b",)], begin, position, np.zeros((n, 3), np.float32))
-    area = rng.uniform(0.1, 2, n)
-    tree = build_tree(shape, area, b"")
-    rows, dense = random_rows(60, n)
-    b = (1 + position[shape.order]).astype(np.float32)
-    errors = []
-    for k in (5, 20, 60, n):
-        compressed = compress_rows(rows, tree, area, k)
-        assert np.diff(compressed.coefficients.indptr).max() <= k
-        errors.append(np.abs(compressed.matmul(b) - dense @ b).max())
-    assert errors[-1] < 1e-4 * (dense @ b).max()
-    assert errors == sorted(errors, reverse=True)
-    with pytest.raises(ValueError, match="another cluster tree"):
-        compress_rows(rows, tree, area + 1, 5)
