@@ -14,14 +14,19 @@ from icheat_usd.kernels.simd import (
     black,
     color_add,
     is_black,
+    load,
     load_rgb,
+    multiply_add,
+    product,
     scale_add,
+    store,
+    store_color,
     store_rgb,
     weighted_sum,
 )
 
 ENTRIES = 4  # of a group
-_CHUNK = 2048  # pixels or view samples: their products stay in the cache
+_CHUNK = 1024  # pixels or view samples: what is between two passes over them stays in the first-level cache
 
 
 class InterpolationTable(NamedTuple):
@@ -96,28 +101,83 @@ def _places(row, weight, products, tint):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _indirect(at, i, view, total):  # type: ignore[no-untyped-def]
-    """`total` plus what group `i` adds to a view sample."""
-    row, weight, tint = at.row + 16 * i, at.weight + 16 * i, at.tint + 12 * view
-    total = color_add(weighted_sum(at.products, row, weight), load_rgb(tint), total)
-    for lobe in range(1, at.n_lobes):
-        color = load_rgb(tint + lobe * at.tint_step)
-        if not is_black(color):
-            total = color_add(weighted_sum(at.products + lobe * at.products_step, row, weight), color, total)
-    return total
+def _blend_first_lobe(at, first, n, blend):  # type: ignore[no-untyped-def]
+    """Interpolated products of `n` view samples, three floats each; one more is written."""
+    row, weight = at.row + 16 * first, at.weight + 16 * first
+    for _ in range(n):
+        store_color(blend, weighted_sum(at.products, row, weight))
+        row += 16
+        weight += 16
+        blend += 12
 
 
 @kernel
-def _view_chunk(begin, end, row, weight, more_view, more_row, more_weight, products, tint, out):  # type: ignore[no-untyped-def]
-    base = address_of(out)
+def _multiply_run(n, a, b, out):  # type: ignore[no-untyped-def]
+    """``out = a * b`` for `n` colours of three floats."""
+    for _ in range(n // 16):
+        store(out, product(load(a), load(b)))
+        store(out + 64, product(load(a + 64), load(b + 64)))
+        store(out + 128, product(load(a + 128), load(b + 128)))
+        a += 192
+        b += 192
+        out += 192
+    for _ in range(n % 16):
+        store_rgb(out, color_add(load_rgb(a), load_rgb(b), black()))
+        a += 12
+        b += 12
+        out += 12
+
+
+@kernel
+def _add_scaled_run(n, a, gain, out):  # type: ignore[no-untyped-def]
+    """``out += a * gain`` for `n` colours of three floats; at `gain` stands one colour 16 times."""
+    g0, g1, g2 = load(gain), load(gain + 64), load(gain + 128)
+    for _ in range(n // 16):
+        store(out, multiply_add(load(a), g0, load(out)))
+        store(out + 64, multiply_add(load(a + 64), g1, load(out + 64)))
+        store(out + 128, multiply_add(load(a + 128), g2, load(out + 128)))
+        a += 192
+        out += 192
+    for _ in range(n % 16):
+        store_rgb(out, color_add(load_rgb(a), load_rgb(gain), load_rgb(out)))
+        a += 12
+        out += 12
+
+
+@kernel
+def _add_group(at, i, view, first_lobe, place):  # type: ignore[no-untyped-def]
+    """Add what group `i` gives to a view sample in the lobes from `first_lobe` on, where they are not 0."""
+    row, weight, tint = at.row + 16 * i, at.weight + 16 * i, at.tint + 12 * view
+    total = load_rgb(place)
+    for lobe in range(first_lobe, at.n_lobes):
+        color = load_rgb(tint + lobe * at.tint_step)
+        if not is_black(color):
+            total = color_add(weighted_sum(at.products + lobe * at.products_step, row, weight), color, total)
+    store_rgb(place, total)
+
+
+@kernel
+def _indirect_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, out):  # type: ignore[no-untyped-def]
+    """Indirect light of `n` view samples to an address, three floats each."""
     at = _places(row, weight, products, tint)
-    for v in range(begin, end):
-        store_rgb(base + 12 * v, _indirect(at, v, v, black()))
+    blend = np.empty(3 * n + 1, np.float32)
+    _blend_first_lobe(at, first, n, address_of(blend))
+    _multiply_run(n, address_of(blend), at.tint + 12 * first, out)
+    if at.n_lobes > 1:
+        for v in range(first, first + n):
+            _add_group(at, v, v, 1, out + 12 * (v - first))
     more = _places(more_row, more_weight, products, tint)
-    for m in range(np.searchsorted(more_view, begin), np.searchsorted(more_view, end)):
+    for m in range(np.searchsorted(more_view, first), np.searchsorted(more_view, first + n)):
         v = np.int64(more_view[m])
-        place = base + 12 * v
-        store_rgb(place, _indirect(more, m, v, load_rgb(place)))
+        _add_group(more, m, v, 0, out + 12 * (v - first))
+    # Numba may free an array after its last mention, and addresses do not count.
+    blend[0] = np.float32(0.0)
+
+
+@kernel
+def _view_chunk(first, n, row, weight, more_view, more_row, more_weight, products, tint, out):  # type: ignore[no-untyped-def]
+    place = address_of(out) + 12 * first
+    _indirect_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, place)
 
 
 @parallel_kernel
@@ -136,16 +196,37 @@ def assemble_view(row, weight, more_view, more_row, more_weight, products, tint,
     """
     n = len(out)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        begin, end = chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)
-        _view_chunk(begin, end, row, weight, more_view, more_row, more_weight, products, tint, out)
+        first = chunk * _CHUNK
+        count = min(n - first, _CHUNK)
+        _view_chunk(first, count, row, weight, more_view, more_row, more_weight, products, tint, out)
 
 
 @kernel
-def _direct(direct, step, gains, n_lights, total):  # type: ignore[no-untyped-def]
-    """`total` plus the direct light of a view sample; addresses of the first light's, and from light to light."""
-    for light in range(n_lights):
-        total = color_add(load_rgb(direct + light * step), load_rgb(gains + 12 * light), total)
-    return total
+def _sent_run(  # type: ignore[no-untyped-def]
+    first, n, row, weight, more_view, more_row, more_weight, products, tint, direct, gains, throughput, out
+):
+    """Direct and indirect light of `n` view samples times their throughput to an address."""
+    _indirect_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, out)
+    gain = np.empty(48, np.float32)
+    for light in range(len(direct)):
+        for i in range(48):
+            gain[i] = gains[light, i % 3]
+        place = address_of(direct) + 12 * (light * direct.shape[1] + first)
+        _add_scaled_run(n, place, address_of(gain), out)
+    if len(throughput) > 0:
+        _multiply_run(n, out, address_of(throughput) + 12 * first, out)
+    gain[0] = np.float32(0.0)  # keeps it, see `_indirect_run`
+
+
+@kernel
+def _sum_samples(begin, end, sample_begin, sent, film):  # type: ignore[no-untyped-def]
+    """Pixels ``begin:end`` as sums of their samples, at addresses; `sent` is that of the first one's."""
+    for p in range(begin, end):
+        total = black()
+        for _ in range(sample_begin[p], sample_begin[p + 1]):
+            total = scale_add(load_rgb(sent), np.float32(1.0), total)
+            sent += 12
+        store_rgb(film + 12 * p, total)
 
 
 @kernel
@@ -168,27 +249,17 @@ def _film_chunk(  # type: ignore[no-untyped-def]
     still,
     film,
 ):
-    base, factor = address_of(film), address_of(throughput)
-    lit, lit_step, light_gains, n_lights = address_of(direct), 12 * direct.shape[1], address_of(gains), len(direct)
-    weighted = len(throughput) > 0
-    at = _places(row, weight, products, tint)
-    for p in range(begin, end):
-        total = black()
-        for sample in range(sample_begin[p], sample_begin[p + 1]):
-            v = np.int64(sample)
-            sent = _direct(lit + 12 * v, lit_step, light_gains, n_lights, _indirect(at, v, v, black()))
-            total = color_add(sent, load_rgb(factor + 12 * v), total) if weighted else sent
-        store_rgb(base + 12 * p, total)
-    more = _places(more_row, more_weight, products, tint)
-    first, last = sample_begin[begin], sample_begin[end]
-    for m in range(np.searchsorted(more_view, first), np.searchsorted(more_view, last)):
-        v = np.int64(more_view[m])
-        place = base + 12 * np.int64(pixel[v])
-        if weighted:
-            sent = color_add(_indirect(more, m, v, black()), load_rgb(factor + 12 * v), load_rgb(place))
-        else:
-            sent = _indirect(more, m, v, load_rgb(place))
-        store_rgb(place, sent)
+    base = address_of(film)
+    first = np.int64(sample_begin[begin])
+    n = np.int64(sample_begin[end]) - first
+    # As many samples as pixels, and none with two: they are the pixels.
+    in_order = len(throughput) == 0 and n == end - begin
+    space = np.empty(0 if in_order else 3 * n, np.float32)
+    place = base + 12 * begin if in_order else address_of(space)
+    _sent_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, direct, gains, throughput, place)
+    if not in_order:
+        _sum_samples(begin, end, sample_begin, place, base)
+        space[:1] = np.float32(0.0)  # keeps it, see `_indirect_run`
     for s in range(np.searchsorted(still_pixel, begin), np.searchsorted(still_pixel, end)):
         place = base + 12 * np.int64(still_pixel[s])
         store_rgb(place, scale_add(load_rgb(address_of(still) + 12 * s), np.float32(1.0), load_rgb(place)))
