@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,10 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from icheat_usd.kernels.assemble import assemble_film, interpolation_table
 from icheat_usd.kernels.packed import LANES, PairedTiles, multiply_paired_tiles, multiply_tiles, pair_coefficients
 from icheat_usd.kernels.simd import address_of, load, multiply_add, spread, store, zeros
+from icheat_usd.samples import ViewSamples
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
 from icheat_usd.scene import F32, I32
 from icheat_usd.transport.packed import PackedRows, PackedTransport
@@ -41,6 +43,7 @@ class Timing:
     threads: int
     median: float
     quartiles: tuple[float, float]
+    least: float
     n_bytes: int  #: that it must read
 
     @property
@@ -53,6 +56,7 @@ class Timing:
             "threads": self.threads,
             "median_s": self.median,
             "quartiles_s": list(self.quartiles),
+            "least_s": self.least,
             "bytes": self.n_bytes,
             "GB/s": self.gigabytes_per_second,
         }
@@ -74,7 +78,9 @@ def time_in_turns(contenders: dict[tuple[str, int], tuple[Work, int]], rounds: i
     timings = []
     for (name, threads), (_, n_bytes) in contenders.items():
         low, middle, high = np.percentile(seconds[name, threads][1:], [25, 50, 75])
-        timings.append(Timing(name, threads, float(middle), (float(low), float(high)), n_bytes))
+        timings.append(
+            Timing(name, threads, float(middle), (float(low), float(high)), min(seconds[name, threads][1:]), n_bytes)
+        )
     return timings
 
 
@@ -287,6 +293,82 @@ def measure_product(packed: PackedTransport, b: F32, rounds: int = 21) -> dict[s
         "difference": differences,
         "bytes": n_bytes,
     }
+
+
+def measure_frame(
+    packed: PackedTransport, view: ViewSamples, b: F32, direct: F32, rounds: int = 41
+) -> dict[str, list[dict[str, Any]]]:
+    """Each stage of a frame from the cells' light to the film, the frame, and reading what each must read.
+
+    Parameters
+    ----------
+    b : (n_leaves, 3) float32
+        Light that leaves the gather cells.
+    direct : (n_lights, n_view, 3) float32
+        Reflected direct light.
+
+    Notes
+    -----
+    All lobes are taken to have the tiles of the first, as `pack` makes them.
+    """
+    products = _products(packed, b)
+    n_rows = products[0].out.shape[0] * LANES
+    plan, values = plan_haar(products[0].rows.tree), np.ascontiguousarray(b[None])
+    out = np.zeros((len(products), n_rows, 4), np.float32)
+    products = [replace(item, out=out[i].reshape(-1, LANES, 4)) for i, item in enumerate(products)]
+    spread_rows = packed.interpolation
+    if spread_rows is None:
+        n = view.n
+        spread_rows = SparseRows(np.arange(n + 1), np.arange(n, dtype=np.int32), np.ones(n, np.float32), n)
+    table = interpolation_table(spread_rows.indptr, spread_rows.indices, spread_rows.weights)
+    tint = np.stack([lobe.tint for lobe in packed.lobes if len(lobe.rows.index)])
+    gains = np.ones((len(direct), 3), np.float32)
+    n_pixels = view.width * view.height
+    sample_begin = np.searchsorted(view.pixel, np.arange(n_pixels + 1)).astype(np.int32)
+    plain = bool(np.all(view.throughput == 1)) and np.diff(sample_begin).max(initial=0) <= 1
+    throughput = view.throughput[:0] if plain else view.throughput
+    still = np.flatnonzero(view.background.any(axis=1)).astype(np.int32)
+    background = np.ascontiguousarray(view.background[still])
+    film = np.empty((n_pixels, 3), np.float32)
+
+    def haar() -> None:
+        haar_of_versions(plan, values, products[0].coefficients)
+
+    def floats() -> None:
+        for item in products:
+            item.in_floats()
+
+    def integers() -> None:
+        for item in products:
+            item.in_integers()
+
+    def pixels() -> None:
+        assemble_film(*table, out, tint, direct, gains, throughput, sample_begin, view.pixel, still, background, film)
+
+    def frame() -> None:
+        haar()
+        integers()
+        pixels()
+
+    sizes = {
+        "Haar transform": values.nbytes + 16 * len(b) + 16 * len(b),
+        "product": sum(item.rows.n_bytes for item in products),
+        "pixels": sum(column.nbytes for column in table)
+        + tint.nbytes
+        + direct.nbytes
+        + throughput.nbytes
+        + film.nbytes,
+    }
+    contenders: dict[tuple[str, int], tuple[Work, int]] = {}
+    for threads in (1, 2):
+        contenders["Haar transform", threads] = (haar, sizes["Haar transform"])
+        contenders["product, float sums", threads] = (floats, sizes["product"])
+        contenders["product, integer sums", threads] = (integers, sizes["product"])
+        contenders["pixels", threads] = (pixels, sizes["pixels"])
+        contenders["frame", threads] = (frame, sum(sizes.values()))
+        for name, size in (*sizes.items(), ("frame", sum(sizes.values()))):
+            contenders[f"reading as many bytes: {name}", threads] = (reading(size), size)
+    return {"stages": [timing.as_dict() for timing in time_in_turns(contenders, rounds)]}
 
 
 def _difference(item: _Product, expected: F32) -> float:
