@@ -450,6 +450,11 @@ class LiveSession:
             yield frame, self.frame()
 
     @property
+    def playhead(self) -> float | None:
+        """The frame that is shown; None is the stage's first."""
+        return self._frames.resident.playhead
+
+    @property
     def resident(self) -> Mapping[float | None, Level]:
         """Frames in memory, and how good each is."""
         resident = self._frames.resident

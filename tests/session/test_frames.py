@@ -68,7 +68,7 @@ def test_play_shows_every_frame_as_a_session_of_its_own_would_and_keeps_to_the_l
     choices = {"width": 24, "height": 18, "quality": QUALITY}
     frames = (20.0, 21.0, 22.0, 23.0)
     with LiveSession.open(stage, frame=20.0, **choices) as live:
-        images = dict(live.play(frames, level="rest")
+        images = dict(live.play(frames, level="rest"))
         assert set(live.resident) == set(frames)
         memory = live.memory()
         assert 0 < memory["own"] < memory["frame"] < memory["total"] < len(frames) * memory["frame"]
@@ -89,7 +89,7 @@ def test_where_only_keys_animate_frames_share_everything_and_keys_interpolate(tm
         live.add_edit("warm", layer="room.usda", receivers=["/World/Room"], casters=["/World/Room"], frame=1.0)
         live.set_edit("warm", layer="room.usda", amount=0.0, time=1.0)
         live.set_edit("warm", layer="room.usda", amount=1.0, parameters={"gain": 5.0}, time=11.0)
-        images = dict(live.play((1.0, 6.0, 11.0), level="rest")
+        images = dict(live.play((1.0, 6.0, 11.0), level="rest"))
         assert live.memory()["own"] < 1000
     still, half, full = (images[frame].astype(float) for frame in (1.0, 6.0, 11.0))
     # Half the amount; of the gain, which has one time sample, all.
