@@ -9,7 +9,7 @@ import numpy as np
 from icheat_usd.materials import is_glossy, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, I32, SceneSnapshot
+from icheat_usd.scene import F32, I32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport.interpolate import sparse_rows_of_view
 from icheat_usd.transport.rays import RowBuilder
@@ -39,6 +39,7 @@ class Transport:
     interpolation: SparseRows | None  #: (n_view x n_rows); None where rows are view samples
     rays_per_row: int = 256  #: that the rows were measured with
     seed: int = 0  #: of these rays
+    stream: I64 | None = None  #: (n_rows,) sequence that each row's rays are from; None: its view sample's number
 
     def to_view(self, radiance: F32) -> F32:
         """Indirect radiance that view samples send to the eye.

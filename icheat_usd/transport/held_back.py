@@ -74,10 +74,11 @@ class HeldBack:
             builder = _BehindOccluders(self._snapshot, self._tracer, clear, self._gather, transport.seed, occluders)
             one_each = np.arange(len(which) + 1, dtype=np.int64)
             rays = transport.rays_per_row
-            found = [builder.diffuse_rows(points, one_each, row_view, rays, 0, self._progress, "rays behind occluders")]
+            stream = row_view if transport.stream is None else transport.stream[which]
+            found = [builder.diffuse_rows(points, one_each, stream, rays, 0, self._progress, "rays behind occluders")]
             glossy = np.flatnonzero(is_glossy(points))
             if len(glossy):
-                found += builder.specular_rows(points, view.to_eye[row_view], row_view, glossy, rays, self._progress)
+                found += builder.specular_rows(points, view.to_eye[row_view], stream, glossy, rays, self._progress)
         finally:
             clear.close()
         return tuple(

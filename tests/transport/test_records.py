@@ -1,0 +1,162 @@
+"""Records: interpolation that is exact where it must be, and nothing across edges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icheat_usd.samples import ViewSamples, view_samples
+from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.tracing import build_tracer
+from icheat_usd.transport import Transport, build_bounces
+from icheat_usd.transport.progressive import build_transports
+from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
+from icheat_usd.transport.training import training_radiance
+from tests.pipeline import Pipeline
+from tests.scenes import Mesh, box, cornell, look_at, make_snapshot, quad, translation
+
+
+def floor_scene(width: int = 48, height: int = 36) -> SceneSnapshot:
+    """A floor at a slant, and a block in front of it."""
+    block = Mesh(box((0.3, 0.6, 0.3)), transforms=[translation(0.2, 0.3, 0.3)], path="/block")
+    camera = look_at((0.4, 1.2, 2.0), (0, 0.1, 0), fov=40, width=width, height=height)
+    return make_snapshot([Mesh(quad(3), path="/floor"), block], camera=camera)
+
+
+def place(scene: SceneSnapshot, response: F32, view: ViewSamples, **settings: float) -> list[Records]:
+    """Records for lights whose response is given at every view sample: (n_view, n_lights)."""
+
+    def probe(samples: I64) -> F32:
+        return np.broadcast_to(response[samples], (2, 1, len(samples), response.shape[1]))
+
+    tint = np.ones((1, view.n), np.float32)
+    return list(place_records(view, scene.camera, probe, tint, RecordSettings(**settings)))  # type: ignore[arg-type]
+
+
+def view_of(scene: SceneSnapshot) -> ViewSamples:
+    return view_samples(scene, build_tracer(scene))
+
+
+def linear(view: ViewSamples) -> F32:
+    """Two lights whose response is linear in space, another on each surface."""
+    on_floor = view.points.instance[:, None] == 0
+    x, y, z = view.points.position.T
+    return np.where(on_floor, np.stack([2 + x, 3 - z], 1), np.stack([5 + y + 0.5 * x, 0.1 + 0 * y], 1)).astype(
+        np.float32
+    )
+
+
+def test_weights_sum_to_one_and_join_nothing_across_edges() -> None:
+    scene = floor_scene()
+    view = view_of(scene)
+    for records in place(scene, linear(view), view, coarsest=8, max_share=0.5):
+        spread = records.interpolation
+        assert spread.shape == (view.n, len(records.view))
+        np.testing.assert_allclose(spread.row_sums(), 1, rtol=1e-5)
+        assert spread.weights.min() >= 0 and np.diff(spread.indptr).max() <= 8
+        np.testing.assert_array_equal(
+            spread.matmul(np.arange(len(records.view), dtype=np.float32)[:, None])[records.view, 0],
+            np.arange(len(records.view)),
+        )
+    owner = np.repeat(np.arange(view.n), np.diff(spread.indptr))
+    other = records.view[spread.indices]
+    p, n = view.points.position, view.points.normal
+    assert np.array_equal(view.points.instance[owner], view.points.instance[other])
+    assert (n[owner] * n[other]).sum(1).min() > 0.99
+    assert np.abs(((p[other] - p[owner]) * n[owner]).sum(1)).max() < 1e-5
+
+
+def test_what_is_linear_on_a_plane_is_reproduced_exactly_across_blocks_of_all_sizes() -> None:
+    scene = floor_scene()
+    view = view_of(scene)
+    light = linear(view)
+    # A light that bends in one corner only, so that blocks there become small and their neighbours get nodes on edges.
+    bend = np.where(view.points.position[:, :1] < -0.5, np.sin(9 * view.points.position), 0).astype(np.float32)
+    records = place(scene, np.concatenate([light, 3 * bend[:, :1]], 1), view, coarsest=16, max_share=0.6)[-1]
+    inside = records.fit > 1 - 1e-6
+    assert inside.mean() > 0.5 and len(records.view) < 0.61 * view.n
+    got = records.interpolation.matmul(light[records.view])
+    np.testing.assert_allclose(got[inside], light[inside], rtol=2e-5)
+
+
+def test_more_records_where_light_changes() -> None:
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
+    view = view_of(scene)
+    edge = (view.points.position[:, :1] > 0.3).astype(np.float32) + 0.5
+    flat = place(scene, np.ones((view.n, 1), np.float32), view, tolerance=0.005)[-1]
+    found = place(scene, edge, view, tolerance=0.005, max_share=0.4)[-1]
+    assert len(flat.view) < 0.02 * view.n
+    near = np.abs(view.points.position[found.view, 0] - 0.3) < 0.2
+    assert near.mean() > 0.5
+    wrong = found.interpolation.matmul(edge[found.view]) - edge
+    assert np.sqrt(np.mean(wrong**2) / np.mean(edge**2)) < 0.05
+
+
+def test_interpolated_light_has_no_steps_between_blocks() -> None:
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
+    view = view_of(scene)
+    x, z = view.points.position[:, 0], view.points.position[:, 2]
+    smooth = (2 + np.sin(3 * x) * np.cos(2 * z) + 1 / (0.2 + (x - 0.6) ** 2 + z**2))[:, None].astype(np.float32)
+    records = place(scene, smooth, view, tolerance=0.02, max_share=0.2)[-1]
+    image = records.interpolation.matmul(smooth[records.view]).reshape(64, 64)
+    exact = smooth.reshape(64, 64)
+    for axis in (0, 1):
+        step, true = np.abs(np.diff(image, axis=axis)), np.abs(np.diff(exact, axis=axis))
+        assert step.max() < 1.5 * true.max()
+
+
+def test_records_without_a_place_are_refused() -> None:
+    for wrong in ({"tolerance": 0.0}, {"max_share": 2.0}, {"coarsest": 12}):
+        with pytest.raises(ValueError, match="tolerance|coarsest"):
+            RecordSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_neighbours_in_tile_order_face_alike() -> None:
+    rng = np.random.default_rng(0)
+    position = rng.random((2048, 3)).astype(np.float32)
+    normal = np.eye(3, dtype=np.float32)[rng.integers(0, 3, 2048)]
+    order = tile_order(position, normal)
+    assert np.array_equal(np.sort(order), np.arange(2048))
+    spread = np.mean([normal[order[t : t + 64]].std(axis=0).sum() for t in range(0, 2048, 64)])
+    assert spread < 0.4 * normal.std(axis=0).sum()
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[Pipeline, list[Transport]]:
+    parts = Pipeline(cornell(40, 40), n_gather=300, rays=4096)
+    bounces = build_bounces(parts.snapshot, parts.tracer, parts.gather, rays_per_row=32)
+    training = training_radiance(parts.snapshot, parts.tracer, parts.gather, bounces, 12)
+    settings = RecordSettings(tolerance=0.01, max_share=0.7, coarsest=8)
+    found = build_transports(
+        parts.snapshot, parts.tracer, parts.view, parts.gather, training, settings=settings, rays_per_row=4096
+    )
+    return parts, list(found)
+
+
+def test_transports_get_better_and_end_close_to_rows_at_every_pixel(room: tuple[Pipeline, list[Transport]]) -> None:
+    parts, transports = room
+    light = parts.gather.points.position[:, [0, 1, 2]] * 0.4 + 1
+    exact = parts.transport.to_view(light)
+    errors = [np.sqrt(np.mean((t.to_view(light) - exact) ** 2) / np.mean(exact**2)) for t in transports]
+    assert errors[-1] < 0.02 and errors[-1] < 0.5 * errors[0]
+    last = transports[-1]
+    assert last.rays_per_row == 4096 and last.stream is None and len(last.row_view) < 0.7 * parts.view.n
+    assert len(transports[0].row_view) < len(last.row_view)
+
+
+def test_rows_of_records_are_those_of_the_plain_transport(room: tuple[Pipeline, list[Transport]]) -> None:
+    parts, transports = room
+    rows, plain = transports[-1].lobes[0].rows, parts.transport.lobes[0].rows
+    for row in range(0, rows.n_rows, 37):
+        sample = int(transports[-1].row_view[row])
+        one, other = rows.rows(row, row + 1), plain.rows(sample, sample + 1)
+        assert np.array_equal(one.indices, other.indices)
+        np.testing.assert_allclose(one.weights, other.weights, rtol=1e-6)
+
+
+def test_placement_is_repeatable(room: tuple[Pipeline, list[Transport]]) -> None:
+    scene = floor_scene()
+    view = view_of(scene)
+    one, two = (place(scene, linear(view), view, coarsest=8)[-1] for _ in range(2))
+    assert np.array_equal(one.view, two.view)
+    assert np.array_equal(one.interpolation.weights, two.interpolation.weights)
