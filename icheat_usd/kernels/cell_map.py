@@ -29,8 +29,8 @@ class CellTable(NamedTuple):
     """Entries are a sample, or ``-1 - first`` of a list in `candidates`, or `WALK`."""
 
     place: NDArray[np.int64]  #: (n_instances,) added to a triangle's row gives its placed triangle; or `NO_FACES`
-    face: NDArray[np.int32]  #: (2 * n_placed, 3) of each side: entry; or first square, squares along each edge
-    square: NDArray[np.int32]  #: entries of the squares of divided sides
+    face: NDArray[np.int32]  #: (2 * n_placed, 3) of each side: entry, 0, 0; or first square, squares along each edge
+    square: NDArray[np.int32]  #: entries of the squares of divided sides, block by block of 4 by 4
     candidates: NDArray[np.int32]  #: lists: how many, then samples, ascending
 
 
@@ -118,7 +118,8 @@ def entry_at(place, face, square, i, t, side, u, v):  # type: ignore[no-untyped-
         return np.int64(face[f, 0])
     a = min(max(np.int64(u * np.float32(along_u)), 0), along_u - 1)
     b = min(max(np.int64(v * np.float32(along_v)), 0), along_v - 1)
-    return np.int64(square[np.int64(face[f, 0]) + b * along_u + a])
+    block = (b >> 2) * ((along_u + 3) >> 2) + (a >> 2)  # a block of 4 by 4 entries is a line of the cache
+    return np.int64(square[np.int64(face[f, 0]) + (block << 4) + ((b & 3) << 2) + (a & 3)])
 
 
 @kernel
@@ -386,6 +387,6 @@ def store_entries(  # type: ignore[no-untyped-def]
                 for a in range(count[b, q]):
                     candidates[list_begin[b, q] + 1 + a] = found[b, q, a]
             if along_u * along_v > 1:
-                square[square_begin[side] + v * along_u + u] = entry
+                square[square_begin[side] + BLOCK * BLOCK * block_number[b] + q] = entry
             else:
                 face[side, 0] = entry

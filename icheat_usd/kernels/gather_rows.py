@@ -168,6 +168,8 @@ def count_hits(  # type: ignore[no-untyped-def]
         origin, order = np.empty(BATCH, np.int64), np.empty(BATCH, np.int64)
         bin_of, bin_begin = np.empty(BATCH, np.int32), np.empty(_BINS * _BINS + 2, np.int64)
         key = np.empty(BATCH, np.int32)
+        entries, listed = np.empty(16, np.int64), np.empty(16, np.int64)
+        instances, sides, at = np.empty(16, np.int64), np.empty(16, np.int64), np.empty((16, 6), np.float32)
         stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
         storage = np.zeros(24 * 16 + 16 + 64, np.float32)
         shift = np.int64((-storage.ctypes.data % 64) // 4)
@@ -223,31 +225,41 @@ def count_hits(  # type: ignore[no-untyped-def]
                     words[11, :] = 0
                     words[17:21, :] = _INVALID
                     _trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
+                    # In steps over the packet, so that the loads of one ray do not wait for those of another.
                     for k in range(width):
                         e = order[first + k]
+                        entries[k] = NOTHING
+                        listed[k] = 0
                         if words[18, k] == _INVALID:
                             if sky_bins > 0:
-                                key[e] = n_cells + octahedral_bin(x[e], y[e], z[e], sky_bins)
+                                entries[k] = n_cells + octahedral_bin(x[e], y[e], z[e], sky_bins)
                             continue
                         i = np.int64(words[18, k] if words[19, k] == _INVALID else words[19, k])
                         t = mesh_begin[instance_mesh[i]] + np.int64(words[17, k])
                         if triangle_route[t] != 0:
-                            key[e] = DETOUR
+                            entries[k] = DETOUR
                             continue
                         plane = plane_of(points, to_object, i, t)
                         if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
                             continue
                         side = side_seen(plane, x[e], y[e], z[e])
-                        entry = entry_at(place, face, square, i, t, side, rays[15, k], rays[16, k])
-                        if entry < 0:
-                            px, py, pz = place_on(points, to_world, i, t, rays[15, k], rays[16, k])
-                            nx, ny, nz = unit_normal(plane, side)
-                            if entry == WALK:
-                                entry = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
+                        entries[k] = entry_at(place, face, square, i, t, side, rays[15, k], rays[16, k])
+                        if entries[k] < 0:
+                            listed[k] = 1
+                            instances[k], sides[k] = i, side
+                            at[k, 0], at[k, 1], at[k, 2] = place_on(points, to_world, i, t, rays[15, k], rays[16, k])
+                            at[k, 3], at[k, 4], at[k, 5] = unit_normal(plane, side)
+                    for k in range(width):
+                        found = entries[k]
+                        if listed[k] == 1:
+                            i, side = instances[k], sides[k]
+                            px, py, pz, nx, ny, nz = at[k, 0], at[k, 1], at[k, 2], at[k, 3], at[k, 4], at[k, 5]
+                            if found == WALK:
+                                found = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
                             else:
                                 detour_2 = slot_detour[slot[2 * i + side]]
-                                entry = nearest_listed(candidates, sample, entry, detour_2, px, py, pz, nx, ny, nz)
-                        key[e] = entry
+                                found = nearest_listed(candidates, sample, found, detour_2, px, py, pz, nx, ny, nz)
+                        key[order[first + k]] = found
                 done += m
                 for r in range(row_0, row_1):
                     for k in range(m):

@@ -32,3 +32,50 @@ def bins_of_directions(directions, n, out):  # type: ignore[no-untyped-def]
     """Bins of directions (m, 3) in an n by n grid."""
     for i in prange(len(out)):
         out[i] = octahedral_bin(directions[i, 0], directions[i, 1], directions[i, 2], n)
+
+
+@kernel
+def octahedral_point(a, b):  # type: ignore[no-untyped-def]
+    """Point of the octahedron ``|x| + |y| + |z| = 1`` for a place in the square from -1 to 1; not of unit length."""
+    y = 1.0 - abs(a) - abs(b)
+    if y >= 0.0:
+        return a, y, b
+    return (1.0 - abs(b) if a >= 0.0 else abs(b) - 1.0), y, (1.0 - abs(a) if b >= 0.0 else abs(a) - 1.0)
+
+
+@parallel_kernel
+def describe_bins(n, parts, direction, solid_angle):  # type: ignore[no-untyped-def]
+    """Unit directions of the bins' middles (n * n, 3), and their solid angles from `parts` squared points each.
+
+    A plane at distance h sends ``h dA / |p|^3``; on a face of the octahedron that is ``da db / |p|^3``.
+    """
+    for i in prange(n * n):
+        column, row = i % n, i // n
+        x, y, z = octahedral_point((2.0 * column + 1.0) / n - 1.0, (2.0 * row + 1.0) / n - 1.0)
+        length = np.sqrt(x * x + y * y + z * z)
+        direction[i, 0], direction[i, 1], direction[i, 2] = x / length, y / length, z / length
+        total = 0.0
+        for j in range(parts):
+            for k in range(parts):
+                a = 2.0 * (column + (j + 0.5) / parts) / n - 1.0
+                b = 2.0 * (row + (k + 0.5) / parts) / n - 1.0
+                x, y, z = octahedral_point(a, b)
+                total += (x * x + y * y + z * z) ** -1.5
+        solid_angle[i] = total * (2.0 / (n * parts)) ** 2
+
+
+@kernel
+def add_patches(direction, solid_angle, radiance, to_world, stretch, n, energy, covered):  # type: ignore[no-untyped-def]
+    """Add light of patches of a dome, turned by `to_world` (3, 3), to the bins that their middles fall in.
+
+    `stretch` is the determinant of `to_world`: scaled directions cover other solid angles.
+    """
+    for i in range(len(direction)):
+        x = to_world[0, 0] * direction[i, 0] + to_world[0, 1] * direction[i, 1] + to_world[0, 2] * direction[i, 2]
+        y = to_world[1, 0] * direction[i, 0] + to_world[1, 1] * direction[i, 1] + to_world[1, 2] * direction[i, 2]
+        z = to_world[2, 0] * direction[i, 0] + to_world[2, 1] * direction[i, 1] + to_world[2, 2] * direction[i, 2]
+        weight = solid_angle[i] * stretch / (x * x + y * y + z * z) ** 1.5
+        b = octahedral_bin(np.float32(x), np.float32(y), np.float32(z), n)
+        covered[b] += weight
+        for c in range(3):
+            energy[b, c] += weight * radiance[i, c]

@@ -55,15 +55,14 @@ def build_cell_map(geometry: Geometry, locator: Locator, *, fineness: float = FI
     kernels.divide_faces(
         geometry.points, geometry.instance_to_world, table, spacing, fineness, placed_instance, place, divided
     )
-    squares = divided.prod(axis=1, dtype=np.int64)
-    squares[squares == 1] = 0
+    blocks = np.maximum(1, (-(-divided // kernels.BLOCK)).prod(axis=1, dtype=np.int64))
+    squares = np.where(divided.prod(axis=1, dtype=np.int64) > 1, kernels.BLOCK**2 * blocks, 0)
     square_begin = np.concatenate([[0], np.cumsum(squares)])
     face = np.zeros((n_sides, 3), np.int32)
     face[:, 0] = square_begin[:-1]
     face[squares > 0, 1:] = divided[squares > 0]
     square = np.full(square_begin[-1], kernels.WALK, np.int32)
 
-    blocks = np.maximum(1, (-(-divided // kernels.BLOCK)).prod(axis=1, dtype=np.int64))
     block_end = np.cumsum(blocks)
     lists = [np.zeros(0, np.int32)]
     stored = 0
