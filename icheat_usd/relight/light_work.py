@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.rows import mean_over_segments
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct, samples_per_light
+from icheat_usd.lighting.domes import BinnedSky, SeenSky, see_sky, white_sky
 from icheat_usd.lighting.points import has_points
 from icheat_usd.lighting.quick import Places, Shadows, build_shadows, direct_at, prepare_places
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.transport import Bounces, solve_bounces
@@ -24,6 +25,9 @@ from icheat_usd.transport.quick_bounces import QuickBounces, build_quick_bounces
 _SMOOTH = 0.3
 
 _RAYS_PER_STEP = 1 << 16  # of the general way
+
+# Rays to the sky of each patch point and view sample, for domes on the move.
+_SKY_OF_CELLS, _SKY_OF_VIEW = 2, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +47,24 @@ class Surroundings:
     patches: Places | None
     tiles: Places | None  #: view samples in the order of tiles of 8 x 8 pixels
     smooth: I64  #: view samples with narrow lobes
+
+    seed: int
+    _sky: list[SeenSky] = field(default_factory=list)  #: of cells and view, once a dome asks for them
+
+    def sky(self) -> list[SeenSky]:
+        """What the cells and the view samples see of the sky; found when first needed, which takes seconds."""
+        if not self._sky:
+            assert self.shadows is not None
+            gather, view = self.gather, self.view
+            even, sampler = white_sky(self.snapshot, self.tracer, gather.patch_points, self.seed)
+            ways = (even, sampler, self.shadows)
+            tint = self.cell_means(self.patch_tint)
+            view_tint = view.points.albedo / np.float32(np.pi)
+            self._sky.append(
+                see_sky(*ways, gather.patch_points, tint, None, _SKY_OF_CELLS, self.seed, gather.cell_begin)
+            )
+            self._sky.append(see_sky(*ways, view.points, view_tint, view.to_eye, _SKY_OF_VIEW, self.seed + 1))
+        return self._sky
 
     def can_move(self, alone: SceneSnapshot) -> bool:
         """Whether the light of a one-light snapshot has the quick way."""
@@ -92,6 +114,7 @@ def build_surroundings(
         patches,
         tiles,
         np.flatnonzero(is_glossy(view.points) & (view.points.roughness < _SMOOTH)),
+        seed,
     )
 
 
@@ -167,12 +190,22 @@ class AnyLight:
         self._n_view = samples_per_light(alone, light_samples, dome_samples)[0]
         self._samplers: list[LightSampler] = []
         self._cell = self._sample = 0
+        self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self._cells = np.zeros((around.gather.n, 3), np.float32)
         self._view = np.zeros((around.view.n, 3), np.float32)
 
     def show(self, radiance: F32, view_direct: F32) -> None:
-        """First look: one shadow ray per cell and view sample."""
+        """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample."""
         around = self._around
+        if around.shadows is not None and self._alone.lights.kind[0] == LightKind.DOME:
+            of_cells, of_view = around.sky()
+            self.bins = self.bins or BinnedSky(self._alone)
+            sky = self.bins.under(self._alone)
+            direct = np.empty((around.gather.n, 3), np.float32)
+            of_cells.light(sky, direct)
+            radiance[:] = around.all_bounces(direct)
+            of_view.light(sky, view_direct)
+            return
         patch = around.gather.cell_begin[:-1]
         points = take_points(around.gather.patch_points, patch)
         arriving = irradiance(self._alone, around.tracer, self._sampler(0), points, self._seed, 1)[0]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from icheat_usd.lighting.change import LightError, changed_light, join_lights, new_light, one_light
+from icheat_usd.lighting.domes import BinnedSky
 from icheat_usd.relight.light_work import AnyLight, MovingLight, Surroundings, build_surroundings
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
@@ -22,6 +23,7 @@ class _Light:
 
     alone: SceneSnapshot
     work: AnyLight | MovingLight | None = None
+    bins: BinnedSky | None = None  #: of a dome's image
 
 
 class LiveLights:
@@ -112,6 +114,8 @@ class LiveLights:
         state.alone = changed_light(
             self._scene, state.alone, to_world=to_world, radiance=radiance, size=size, texture=texture
         )
+        if texture is not None:
+            state.bins = None
         self._show(light)
 
     def add(
@@ -167,6 +171,10 @@ class LiveLights:
         seed = (self._seed + zlib.crc32(state.alone.light_paths[0].encode())) & 0x7FFFFFFF
         counts = self._light_samples, self._dome_samples
         kind = MovingLight if self._around.can_move(state.alone) else AnyLight
-        state.work = kind(self._around, state.alone, seed, *counts)
-        state.work.show(self.radiance[light], self.view_direct[light])
+        work = kind(self._around, state.alone, seed, *counts)
+        if isinstance(work, AnyLight):
+            work.bins = state.bins
+        work.show(self.radiance[light], self.view_direct[light])
+        state.work = work
+        state.bins = work.bins if isinstance(work, AnyLight) else None
         self.revision += 1

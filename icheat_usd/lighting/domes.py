@@ -1,0 +1,181 @@
+"""Domes that turn or change their image: what places see of the sky is kept, the sky is binned anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icheat_usd.kernels import domes as kernels
+from icheat_usd.kernels.direct import fill_analytic
+from icheat_usd.kernels.environment import dome_radiance
+from icheat_usd.lighting.change import append_texture, new_light, texture_image
+from icheat_usd.lighting.quick import Shadows
+from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
+from icheat_usd.materials import evaluate_specular, is_glossy, take_points
+from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot, SurfacePoints, Textures
+from icheat_usd.tracing import Tracer, spawn_points, transmittance
+
+_RAYS = 1 << 18  # at a time
+_WIDTH = 256  # an image is brought to this width once, so that a small sun is never missed between lookups
+_LOOKS = 2  # lookups per bin and axis
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSky:
+    """Directions in which each place sees the sky, by bin, and what light from there is worth."""
+
+    begin: I64  #: (n + 1,)
+    bins: np.ndarray  #: (n_entries,) uint16
+    diffuse: F32  #: (n_entries,) irradiance per radiance
+    glossy: F32  #: (n_entries,) reflected radiance per radiance of the specular lobe; or none
+    tint: F32  #: (n, 3) albedo over pi
+    gloss_tint: F32  #: (n, 3) colour of the specular lobe
+
+    def light(self, sky: F32, out: F32) -> None:
+        """Reflected light of a binned sky (n_bins, 3), into `out` (n, 3)."""
+        kernels.shine(self.begin, self.bins, self.diffuse, self.glossy, sky, self.tint, self.gloss_tint, out)
+
+
+def white_sky(
+    snapshot: SceneSnapshot, tracer: Tracer, points: SurfacePoints, seed: int
+) -> tuple[SceneSnapshot, LightSampler]:
+    """The scene under an even sky, and a sampler that has learnt from where around some points it is seen."""
+    even = new_light(snapshot, "", LightKind.DOME, to_world=np.eye(3, 4), radiance=(1, 1, 1))
+    return even, build_light_sampler(even, tracer, points, seed)
+
+
+def see_sky(
+    even: SceneSnapshot,
+    sampler: LightSampler,
+    shadows: Shadows,
+    points: SurfacePoints,
+    tint: F32,
+    to_eye: F32 | None,
+    n_samples: int,
+    seed: int,
+    begin: I64 | None = None,
+) -> SeenSky:
+    """Sample where places see the sky.
+
+    Parameters
+    ----------
+    even, sampler
+        Of `white_sky`.
+    tint : (n_places, 3), albedo over pi
+    to_eye : (n, 3), unit; None: diffuse reflection alone
+    n_samples : int
+        Rays per point.
+    begin : (n_places + 1,)
+        A place is the mean of its points; by default every point is one.
+    """
+    owners, bins, weights, lobes = [], [], [], []
+    edge_parts = np.zeros((len(points.instance), 2))
+    step = max(1, _RAYS // n_samples)
+    for first in range(0, len(points.instance), step):
+        part = take_points(points, slice(first, first + step))
+        point, direction, value = _visible(even, sampler, shadows, part, first, n_samples, seed)
+        cosine = np.maximum(np.einsum("ij,ij->i", part.shading_normal[point], direction), 1e-6)
+        owners.append(point + first)
+        row = np.empty(len(point), np.uint16)
+        kernels.find_bins(direction, row)
+        bins.append(row)
+        weights.append(value)
+        if to_eye is not None:
+            there = take_points(part, point)
+            terms = evaluate_specular(there, to_eye[first + point], direction)
+            base, edge = (term / cosine * value for term in (terms.base, terms.edge))
+            edge_parts[first : first + step, 0] += np.bincount(point, base, len(part.instance))
+            edge_parts[first : first + step, 1] += np.bincount(point, edge, len(part.instance))
+            # as grey as dielectrics are; the colour of metals comes with `gloss_tint`
+            lobes.append(there.specular.mean(axis=1) * base + there.specular_edge.mean(axis=1) * edge)
+    owner, weight = np.concatenate(owners), np.concatenate(weights)
+    if begin is not None:
+        cell = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
+        weight = np.asarray(weight / np.diff(begin)[cell[owner]], np.float32)
+        owner = cell[owner]
+    ends = np.searchsorted(owner, np.arange(len(tint) + 1)).astype(np.int64)
+    gloss_tint = np.zeros((len(tint), 3), np.float32)
+    glossy = np.empty(0, np.float32)
+    if to_eye is not None and is_glossy(points).any():
+        color = points.specular * edge_parts[:, :1] + points.specular_edge * edge_parts[:, 1:]
+        gloss_tint = (color / np.maximum(color.mean(axis=1, keepdims=True), 1e-30)).astype(np.float32)
+        glossy = np.concatenate(lobes).astype(np.float32)
+    return SeenSky(
+        ends,
+        np.concatenate(bins),
+        weight.astype(np.float32),
+        glossy,
+        np.ascontiguousarray(tint, np.float32),
+        gloss_tint,
+    )
+
+
+def _visible(
+    even: SceneSnapshot, sampler: LightSampler, shadows: Shadows, points: SurfacePoints, first: int, n: int, seed: int
+) -> tuple[I64, F32, F32]:
+    """Point, direction and irradiance per radiance of the rays that see the sky."""
+    size = len(points.instance) * n
+    direction, radiance = np.zeros((size, 3), np.float32), np.zeros((size, 3), np.float32)
+    distance, pdf = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    fill_analytic(
+        even.lights, even.textures, sampler.tables, sampler.guide, 0, points.position, points.normal,
+        points.shading_normal, points.instance, first, n, seed & 0xFFFFFFFF, True, direction, distance, pdf, radiance,
+    )  # fmt: skip
+    rows = np.flatnonzero(radiance[:, 0])
+    start = np.take(spawn_points(even, points, points.normal), rows // n, axis=0)
+    direction = np.take(direction, rows, axis=0)
+    seen = np.flatnonzero(~shadows.opaque.occluded(start, direction))
+    rows, direction, value = rows[seen], np.take(direction, seen, axis=0), radiance[rows[seen], 0]
+    if shadows.passing is not None:
+        value = value * transmittance(even, shadows.passing, start[seen], direction)[:, 0]
+    return rows // n, direction, value
+
+
+class BinnedSky:
+    """Bins of one dome under any rotation."""
+
+    def __init__(self, alone: SceneSnapshot) -> None:
+        row = int(alone.lights.texture[0])
+        none = Textures(
+            np.empty((0, 4), np.float32), np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0, np.int32),
+            np.empty((0, 2), np.int32),
+        )  # fmt: skip
+        self._image = -1 if row < 0 else 0
+        self._texture = none if row < 0 else append_texture(none, _smaller(texture_image(alone.textures, row)))[0]
+
+    def under(self, alone: SceneSnapshot) -> F32:
+        """Mean radiance of each bin as the dome stands in `alone`, (n_bins, 3)."""
+        out = np.zeros((len(_DIRECTIONS), 3), np.float32)
+        linear = alone.lights.to_world[0, :, :3].astype(np.float64)
+        if np.linalg.det(linear) != 0.0:
+            to_local = np.ascontiguousarray(np.linalg.inv(linear))
+            dome_radiance(self._texture, self._image, alone.lights.radiance[0], to_local, _DIRECTIONS, out)
+        return out.reshape(-1, _LOOKS * _LOOKS, 3).mean(axis=1)
+
+
+def _smaller(image: F32) -> F32:
+    """Means over blocks of texels; texels that are no number count as black."""
+    height, width = image.shape[:2]
+    factor = max(1, width // _WIDTH)
+    clean = np.where(np.isfinite(image[..., :3]).all(axis=2, keepdims=True), image[..., :3], 0.0)
+    if factor == 1 or height % factor or width % factor:
+        rows, columns = (np.arange(n) * max(1, n // factor) // n for n in (height, width))
+        sums = np.zeros((rows[-1] + 1, columns[-1] + 1, 3))
+        np.add.at(sums, (rows[:, None], columns[None]), clean)
+        count = np.bincount(rows)[:, None] * np.bincount(columns)[None]
+        return (sums / count[..., None]).astype(np.float32)
+    return clean.reshape(height // factor, factor, width // factor, factor, 3).mean(axis=(1, 3)).astype(np.float32)
+
+
+def _bin_directions() -> F32:
+    """Directions of the lookups of each bin, one bin after another."""
+    look = (np.arange(_LOOKS) + 0.5) / _LOOKS
+    row, column, v, u = np.meshgrid(np.arange(kernels.ROWS), np.arange(kernels.COLUMNS), look, look, indexing="ij")
+    y = 1.0 - 2.0 * (row + v) / kernels.ROWS
+    longitude = 2.0 * np.pi * ((column + u) / kernels.COLUMNS - 0.5)
+    r = np.sqrt(1.0 - y * y)
+    return np.stack([r * np.sin(longitude), y, r * np.cos(longitude)], -1).reshape(-1, 3).astype(np.float32)
+
+
+_DIRECTIONS = _bin_directions()
