@@ -18,8 +18,8 @@ from tools.benchmarking.errors import error_edits
 from tools.benchmarking.made_up_edits import many_edits
 from tools.benchmarking.parts import Effort, Parts
 
-_SMALL = Effort(96, 72, 2048, "DRAFT")
-_TINY = Effort(24, 18, 256, "DRAFT")
+_SMALL = Effort(96, 72, 2048)
+_TINY = Effort(24, 18, 256)
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
@@ -44,7 +44,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
 
 def _against_slow(parts: Parts, n_edits: int) -> dict[str, float]:
     """Largest difference at a view sample over the root mean square light, by stack."""
-    transport = parts.exact
+    transport = parts.transport
     parts.refine_lights()
     live = LiveRelighter(parts.snapshot, parts.view, parts.gather, transport, parts.lights)
     slow = Relighter(parts.view, parts.gather, transport, parts.lights.view_direct, parts.lights.cell_light())

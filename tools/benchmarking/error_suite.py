@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,23 +24,36 @@ QUICK = ErrorSettings(
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
-    """One per stage, and one in the mode for quality where there is one."""
-    return [{"stage": stage} for stage in stages]
+    """Every stage at the settings that frames are measured with, and in the mode for quality."""
+    found: list[dict[str, Any]] = [{"stage": stage} for stage in stages]
+    return found if quick else found + [{"stage": stage, "quality": "LIVE_FINE"} for stage in stages]
 
 
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
     """Errors of one stage."""
-    parts = Parts(case["stage"], effort)
+    fine = "quality" in case
+    parts = Parts(case["stage"], replace(effort, quality=case["quality"]) if fine else effort)
     lights = choose_lights(parts.snapshot, parts.tracer, parts.view)
     under = parts.under(with_lights(parts.snapshot, lights))
-    found = measure_errors(under, QUICK if quick else ErrorSettings(), folder)
+    settings = QUICK if quick else ErrorSettings()
+    if fine:  # what does not depend on the mode is measured once
+        settings = replace(settings, hit_pixels=0, tolerances=())
+    found = measure_errors(under, settings, folder / case.get("quality", "LIVE"))
     for light in lights:
         found["lights"][light.name]["what"] = light.note
     return found
 
 
 def markdown(results: list[dict[str, Any]]) -> list[str]:
-    """Tables for README."""
+    """Tables for README, one pair per quality."""
+    lines: list[str] = []
+    for quality in dict.fromkeys(one["case"].get("quality", "") for one in results):
+        some = [one for one in results if one["case"].get("quality", "") == quality]
+        lines += [*([f"Quality {quality}:", ""] if quality else []), *_tables(some), ""]
+    return lines
+
+
+def _tables(results: list[dict[str, Any]]) -> list[str]:
     lines = [
         "| stage, light | compression and interpolation | total | at rest | largest pixel | cells against true hits |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",

@@ -135,10 +135,9 @@ def _of_light(parts: Parts, references: References, light: int) -> dict[str, Any
             references.own_b[1][light],
         ),
     }  # fmt: skip
-    if parts.transport is not None:
-        exact = probe.to_pixels(parts.transport.to_view(b)[probe.samples])
-        found["packing"] = _difference(packed, exact, references, light)
-        found["unpacked"] = relative_error(exact, references.own_b[0][light], references.own_b[1][light])
+    exact = probe.to_pixels(parts.transport.to_view(b)[probe.samples])
+    found["packing"] = _difference(packed, exact, references, light)
+    found["unpacked"] = relative_error(exact, references.own_b[0][light], references.own_b[1][light])
     return {name: error.as_dict() for name, error in found.items()}
 
 
@@ -154,7 +153,7 @@ def _interpolation(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """What interpolation alone loses, and with packing: rows at the records as converged as those at the pixels."""
     transport = parts.transport
-    if transport is None or transport.interpolation is None:
+    if transport.interpolation is None:
         return
     probe = references.probe.part(settings.record_pixels, settings.seed)
     kept = np.flatnonzero(np.isin(references.probe.pixel, probe.pixel))
@@ -192,7 +191,7 @@ def _interpolation(
 
 def _lobe_products(parts: Parts, view: Any, n_rays: int, seed: int, radiance: F32) -> list[F32]:
     """Products of converged rows with every light's radiance, lobe by lobe: (n_lights, n, 3) each."""
-    n_lobes = len(parts.transport.lobes) if parts.transport is not None else 1
+    n_lobes = len(parts.transport.lobes)
     out = [np.zeros((len(radiance), view.n, 3), np.float32) for _ in range(n_lobes)]
     for first in range(0, view.n, 512):
         part = np.arange(first, min(first + 512, view.n))
@@ -208,7 +207,7 @@ def _lobe_products(parts: Parts, view: Any, n_rays: int, seed: int, radiance: F3
 def _curve(parts: Parts, references: References, settings: ErrorSettings) -> list[dict[str, float]]:
     """Median error over the lights, bytes and frames per second, by tolerance of packing."""
     probe, found = references.probe, []
-    exact = [probe.to_pixels(parts.exact.to_view(b)[probe.samples]) for b in parts.lights.radiance]
+    exact = [probe.to_pixels(parts.transport.to_view(b)[probe.samples]) for b in parts.lights.radiance]
     for tolerance in settings.tolerances:
         packed = parts.pack(tolerance)
         live = LiveRelighter(parts.snapshot, parts.view, parts.gather, packed, parts.lights)
@@ -330,9 +329,8 @@ def _images(parts: Parts, references: References, names: list[str], folder: Path
         root = float(np.sqrt(max((references.own_b[0][light] * references.own_b[1][light]).mean(), 1e-30)))
         off = (probe.to_pixels(shown[probe.samples]) - reference) / root
         written.append(write_error_image(folder / f"{parts.name}_{name}_total.png", off, probe))
-        if parts.transport is not None:
-            lost = (shown - parts.transport.to_view(b)) / root
-            written.append(write_signed_image(folder / f"{parts.name}_{name}_packing.png", lost, parts.view))
+        lost = (shown - parts.transport.to_view(b)) / root
+        written.append(write_signed_image(folder / f"{parts.name}_{name}_packing.png", lost, parts.view))
         written.append(
             write_signed_image(folder / f"{parts.name}_{name}_light.png", shown / root, parts.view, shown=True)
         )

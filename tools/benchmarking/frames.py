@@ -15,6 +15,7 @@ from icheat_usd.scene import LightKind
 from tools.benchmarking.made_up_edits import many_edits, one_edit, ranked_paths
 from tools.benchmarking.meter import Threads, repeat, summary
 from tools.benchmarking.parts import AREA_KINDS, Effort, Parts, with_movable_lights
+from tools.benchmarking.play import frames_of, measure_play
 from tools.benchmarking.strokes import Stroke
 
 #: Frames per second that are hoped for on two cores, by size and change.
@@ -34,9 +35,11 @@ _LARGE = {"width": 1920, "height": 1080}
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
-    """Every stage at the size that was asked for, and large."""
+    """Every stage at the size that was asked for, and large; those that are animated are played too."""
     found: list[dict[str, Any]] = [{"stage": stage} for stage in stages]
-    return found if quick else found + [{"stage": stage, **_LARGE} for stage in stages]
+    if not quick:
+        found += [{"stage": stage, **_LARGE} for stage in stages]
+    return found + [{"stage": stage, "play": len(frames_of(stage))} for stage in stages if frames_of(stage)]
 
 
 @dataclass
@@ -52,6 +55,8 @@ class Scene:
 
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
     """Times of every change with two threads and with one, and whether both gave the same bits."""
+    if "play" in case:
+        return {"play": measure_play(case["stage"], effort, quick)}
     large = "width" in case
     if large:
         effort = replace(effort, width=case["width"], height=case["height"])
@@ -205,9 +210,11 @@ def _turned(matrix: np.ndarray, angle: float) -> np.ndarray:
 
 def markdown(results: list[dict[str, Any]]) -> list[str]:
     """Table for README: frames per second, two threads / one, spread as quartiles."""
-    found = [result["result"] | {"name": result["case"]["name"]} for result in results if "result" in result]
+    every = [result["result"] | {"name": result["case"]["name"]} for result in results if "result" in result]
+    played = [_played(one) for one in every if "play" in one]
+    found = [one for one in every if "changes" in one]
     if not found:
-        return []
+        return played
     lines = [
         "| change | goal | " + " | ".join(f"{one['name']} {one['width']} x {one['height']}" for one in found) + " |",
         "| --- | ---: |" + " ---: |" * len(found),
@@ -217,8 +224,21 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
         cells = [_cell(one["changes"].get(change)) for one in found]
         lines.append(f"| {change} | {', '.join(str(goal) for goal in sorted(goals))} | " + " | ".join(cells) + " |")
     bits = [change["same_bits"] for one in found for change in one["changes"].values()]
-    lines += ["", f"Same bits for one thread and two: {'all' if all(bits) else 'NOT all'} of {len(bits)} changes."]
+    lines += [
+        "",
+        *played,
+        f"Same bits for one thread and two: {'all' if all(bits) else 'NOT all'} of {len(bits)} changes.",
+    ]
     return lines
+
+
+def _played(one: dict[str, Any]) -> str:
+    play = one["play"]
+    return (
+        f"Playing {play['frames']} resident frames of {one['name']} under changing light: {play['fps']:.0f} frames/s;"
+        f" the first takes {play['bytes_of_first'] / 2**20:.0f} MiB,"
+        f" each other {play['bytes_of_each_more'] / 2**20:.0f} MiB."
+    )
 
 
 def _cell(change: dict[str, Any] | None) -> str:

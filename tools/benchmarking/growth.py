@@ -77,7 +77,7 @@ def _effort(effort: Effort, what: str, size: int) -> Effort:
 
 def _warm(stage: str) -> None:
     """Compile, or load, every kernel on a tiny image first."""
-    parts, _ = with_movable_lights(Parts(stage, Effort(24, 16, 256, "DRAFT")))
+    parts, _ = with_movable_lights(Parts(stage, Effort(24, 16, 256)))
     scene = make_scene(parts)
     parts.live.set_stack(scene.stack)
     for step in _steps(scene).values():

@@ -11,6 +11,7 @@ import numpy as np
 
 from icheat_usd.edits.model import EMPTY_STACK, EditStack
 from icheat_usd.relight.lights import LiveLights
+from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.session.document import Session
@@ -18,6 +19,8 @@ from icheat_usd.session.quality import PREVIEW, Quality
 from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport import Transport
+from icheat_usd.transport.packed import PackedTransport
+from icheat_usd.transport.packing import pack
 from tools.benchmarking.stage_names import short_name
 
 AREA_KINDS = (LightKind.SPHERE, LightKind.DISK, LightKind.RECT, LightKind.CYLINDER)
@@ -30,7 +33,7 @@ class Effort:
     width: int = 640
     height: int = 480
     n_gather: int | None = None
-    quality: str = "PREVIEW"  #: name of a quality of `icheat_usd.session`
+    quality: str = "LIVE"  #: name of a quality of `icheat_usd.session`
 
     def settings(self) -> Quality:
         import icheat_usd.session.quality as qualities
@@ -78,44 +81,26 @@ class Parts:
     def bounces(self) -> Any:
         return self._shot.bounces
 
-    @cached_property
-    def transport(self) -> Transport | None:
-        """Exact rows at the records; None where they were not kept."""
-        source = getattr(self.packed, "source", None)
-        return source if isinstance(source, Transport) else self._shot.transport
-
     @property
-    def exact(self) -> Transport:
-        """Rows before packing, whatever `packed` holds."""
+    def transport(self) -> Transport:
+        """Exact rows at the records."""
         return self._shot.transport
 
     @cached_property
-    def packed(self) -> Any:
+    def packed(self) -> PackedTransport:
         """What frames multiply with."""
-        shot = getattr(self._shot, "packed", None)
-        return self.pack() if shot is None else shot
+        return self._shot.packed
 
-    def pack(self, tolerance: float | None = None) -> Any:
-        """The transport packed to a tolerance; None is the preview's own."""
-        from icheat_usd.transport.packing import pack
-
-        options = {} if tolerance is None else {"tolerance": tolerance}
-        return pack(self.exact, self.gather, self._training, **options)
-
-    @cached_property
-    def _training(self) -> F32:
-        from icheat_usd.transport.training import training_radiance
-
-        return training_radiance(self.snapshot, self.tracer, self.gather, self.bounces)
+    def pack(self, tolerance: float) -> PackedTransport:
+        """The transport packed to another tolerance than the preview's own."""
+        return pack(self.transport, self.gather, self._shot.training, tolerance)
 
     @cached_property
     def lights(self) -> LiveLights:
         return LiveLights(self.snapshot, self.tracer, self.view, self.gather, self.bounces)
 
     @cached_property
-    def live(self) -> Any:
-        from icheat_usd.relight.live import LiveRelighter
-
+    def live(self) -> LiveRelighter:
         return LiveRelighter(self.snapshot, self.view, self.gather, self.packed, self.lights)
 
     def shown(self, light: int, *, at_rest: bool) -> F32:

@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     stages = arguments.stages or ([str(ROOT / _QUICK_STAGE)] if arguments.quick else default_stages(ROOT))
     effort = {"width": arguments.width, "height": arguments.height, "n_gather": arguments.gather}
     if arguments.quick:
-        effort = {"width": 32, "height": 24, "n_gather": 512, "quality": "DRAFT"}
+        effort = {"width": 32, "height": 24, "n_gather": 512}
     folder = Path(arguments.output)
     folder.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {
