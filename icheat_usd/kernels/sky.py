@@ -64,18 +64,25 @@ def describe_bins(n, parts, direction, solid_angle):  # type: ignore[no-untyped-
         solid_angle[i] = total * (2.0 / (n * parts)) ** 2
 
 
-@kernel
-def add_patches(direction, solid_angle, radiance, to_world, stretch, n, energy, covered):  # type: ignore[no-untyped-def]
-    """Add light of patches of a dome, turned by `to_world` (3, 3), to the bins that their middles fall in.
+@parallel_kernel
+def add_patches(direction, solid_angle, radiance, to_world, stretch, n, light):  # type: ignore[no-untyped-def]
+    """Light of patches of a dome, turned by `to_world` (3, 3), added to the bins that their middles fall in.
 
-    `stretch` is the determinant of `to_world`: scaled directions cover other solid angles.
+    `light` (parts, n * n, 4), zero before, receives radiance times solid angle,
+    and solid angle, of as many parts of the patches: one thread each, whose sum
+    is the same for any number of threads. `stretch` is the determinant of
+    `to_world`: scaled directions cover other solid angles.
     """
-    for i in range(len(direction)):
-        x = to_world[0, 0] * direction[i, 0] + to_world[0, 1] * direction[i, 1] + to_world[0, 2] * direction[i, 2]
-        y = to_world[1, 0] * direction[i, 0] + to_world[1, 1] * direction[i, 1] + to_world[1, 2] * direction[i, 2]
-        z = to_world[2, 0] * direction[i, 0] + to_world[2, 1] * direction[i, 1] + to_world[2, 2] * direction[i, 2]
-        weight = solid_angle[i] * stretch / (x * x + y * y + z * z) ** 1.5
-        b = octahedral_bin(np.float32(x), np.float32(y), np.float32(z), n)
-        covered[b] += weight
-        for c in range(3):
-            energy[b, c] += weight * radiance[i, c]
+    parts = len(light)
+    for part in prange(parts):
+        for i in range(part * len(direction) // parts, (part + 1) * len(direction) // parts):
+            dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+            x = to_world[0, 0] * dx + to_world[0, 1] * dy + to_world[0, 2] * dz
+            y = to_world[1, 0] * dx + to_world[1, 1] * dy + to_world[1, 2] * dz
+            z = to_world[2, 0] * dx + to_world[2, 1] * dy + to_world[2, 2] * dz
+            length2 = x * x + y * y + z * z
+            weight = solid_angle[i] * stretch / (length2 * np.sqrt(length2))
+            b = octahedral_bin(np.float32(x), np.float32(y), np.float32(z), n)
+            for c in range(3):
+                light[part, b, c] += weight * radiance[i, c]
+            light[part, b, 3] += weight

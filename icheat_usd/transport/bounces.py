@@ -14,6 +14,7 @@ from icheat_usd.samples import GatherSamples, cell_direct
 from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport.rays import RowBuilder
+from icheat_usd.transport.sky import SkyBins
 from icheat_usd.transport.sparse import SparseRows
 
 _CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
@@ -25,6 +26,7 @@ class Bounces:
 
     rows: SparseRows  #: (n_gather x n_gather) form factors without albedo; row sums at most 1
     albedo: F32  #: (n_gather, 3) mean reflectance of the cells
+    sky: SparseRows | None = None  #: (n_gather x bins) rays of the cells that leave the scene, where asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +65,14 @@ def build_bounces(
     rays_per_row: int = 256,
     seed: int = 0,
     progress: Progress = silent,
+    sky: SkyBins | None = None,
 ) -> Bounces:
-    """Measure with gather rays what the cells receive from each other.
+    """Measure with gather rays what the cells receive from each other, and from bins of the sky if these are given.
 
     Rays start from the patch points, so that a row is the mean over its cell.
     """
     builder = RowBuilder(snapshot, tracer, gather, seed)
-    rows = builder.diffuse_rows(
+    rows = builder.measure(
         gather.patch_points,
         gather.cell_begin,
         np.arange(gather.n, dtype=np.int64),
@@ -77,10 +80,11 @@ def build_bounces(
         1,
         progress,
         "bounce rays",
+        sky=sky,
     )
     albedo = np.empty((gather.n, 3), np.float32)
     row_kernels.mean_over_segments(gather.cell_begin, effective_albedo(gather.patch_points), albedo)
-    return Bounces(rows, albedo)
+    return Bounces(rows.cells, albedo, rows.sky if sky else None)
 
 
 def solve_bounces(bounces: Bounces, direct: F32, n_bounces: int) -> F32:

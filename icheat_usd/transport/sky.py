@@ -11,6 +11,7 @@ from icheat_usd.kernels import sky as kernels
 from icheat_usd.scene import F32, F64, I32, I64
 
 _PATCHES_PER_BIN = 64  # each counts for the bin that its middle falls in, so the border of a bin is only as sharp
+_PARTS = 4  # that threads work on; a fixed number, so that sums do not depend on the threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +110,12 @@ class SkyBins:
         stretch = abs(float(np.linalg.det(linear)))
         energy, covered = np.zeros((self.n, 3), np.float64), np.zeros(self.n, np.float64)
         if stretch > 0.0:
+            parts = np.zeros((_PARTS, self.n, 4), np.float64)
             kernels.add_patches(
-                dome.direction, dome.solid_angle, dome.radiance, linear, stretch, self.resolution, energy, covered
+                dome.direction, dome.solid_angle, dome.radiance, linear, stretch, self.resolution, parts
             )
+            light = parts.sum(axis=0)
+            energy, covered = light[:, :3], light[:, 3]
             missed = np.flatnonzero(covered == 0.0)  # by the middles of all patches: the dome is stretched
             local = self.direction[missed].astype(np.float64) @ np.linalg.inv(linear).T
             energy[missed], covered[missed] = dome.radiance[_nearest_patch(dome, local)], 1.0
