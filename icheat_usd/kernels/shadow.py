@@ -16,7 +16,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.embree import _call_packet
+from icheat_usd.kernels.embree import call_packet
 from icheat_usd.kernels.random import hash_u32, to_unit
 
 RUN = 64  #: successive places that share shadow rays if that is allowed
@@ -99,14 +99,14 @@ def _trace(
             words[9, lane] = _INVALID
             words[10, lane] = 0
             words[11, lane] = 0
-        _call_packet(function, valid.ctypes.data, opaque, rays.ctypes.data)
+        call_packet(function, valid.ctypes.data, opaque, rays.ctypes.data, 0)
         for lane in range(count):
             state[rows[begin + lane]] = _CLEAR if rays[8, lane] >= _ZERO else _BLOCKED
         if passing == 0:
             continue
         for lane in range(count):
             valid[lane] = -1 if rays[8, lane] >= _ZERO else 0
-        _call_packet(function, valid.ctypes.data, passing, rays.ctypes.data)
+        call_packet(function, valid.ctypes.data, passing, rays.ctypes.data, 0)
         for lane in range(count):
             if valid[lane] != 0 and rays[8, lane] < _ZERO:
                 state[rows[begin + lane]] = _THROUGH

@@ -14,7 +14,7 @@ from icheat_usd.lighting.quick import Shadows
 from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
 from icheat_usd.materials import evaluate_specular, is_glossy, take_points
 from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot, SurfacePoints, Textures
-from icheat_usd.tracing import Tracer, spawn_points, transmittance
+from icheat_usd.tracing import Tracer, spawn_points
 
 _RAYS = 1 << 18  # at a time
 _WIDTH = 256  # an image is brought to this width once, so that a small sun is never missed between lookups
@@ -127,9 +127,7 @@ def _visible(
     direction = np.take(direction, rows, axis=0)
     seen = np.flatnonzero(~shadows.opaque.occluded(start, direction))
     rows, direction, value = rows[seen], np.take(direction, seen, axis=0), radiance[rows[seen], 0]
-    if shadows.passing is not None:
-        value = value * transmittance(even, shadows.passing, start[seen], direction)[:, 0]
-    return rows // n, direction, value
+    return rows // n, direction, value * shadows.crossing(even, start[seen], direction, np.inf)
 
 
 class BinnedSky:

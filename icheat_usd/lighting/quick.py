@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
+from icheat_usd.kernels.see_through import cross_layers
 from icheat_usd.kernels.shadow import light_places
 from icheat_usd.lighting.points import light_points
 from icheat_usd.materials import is_glossy
 from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import build_tracer, spawn_points, transmittance
+from icheat_usd.tracing import build_tracer, spawn_points
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.tracing.paths import passing_materials
 
@@ -22,6 +23,27 @@ class Shadows:
 
     opaque: EmbreeTracer
     passing: EmbreeTracer | None  #: triangles that may let light through; None: there are none
+
+    def crossing(self, snapshot: SceneSnapshot, origin: F32, direction: F32, limit: float) -> F32:
+        """Share of light (n,) that crosses the see-through triangles up to `limit`; see `tracing.transmittance`."""
+        out = np.ones(len(origin), np.float32)
+        if self.passing is not None:
+            function, scene = self.passing.address_of("rtcIntersect1")
+            geometry = snapshot.geometry
+            cross_layers(
+                function,
+                scene,
+                geometry.mesh_begin,
+                geometry.instance_mesh,
+                geometry,
+                snapshot.materials,
+                snapshot.textures,
+                np.ascontiguousarray(origin, np.float32),
+                np.ascontiguousarray(direction, np.float32),
+                limit,
+                out,
+            )
+        return out
 
 
 def build_shadows(snapshot: SceneSnapshot, tracer: EmbreeTracer) -> Shadows:
@@ -95,8 +117,8 @@ def direct_at(snapshot: SceneSnapshot, shadows: Shadows, places: Places, seed: i
     n = len(places.place)
     found = out if places.order is None else np.empty((n, 3), np.float32)
     through = np.empty(n, np.int32)
-    function, opaque = shadows.opaque.occluded_function()
-    passing = 0 if shadows.passing is None else shadows.passing.occluded_function()[1]
+    function, opaque = shadows.opaque.address_of("rtcOccluded16")
+    passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
     light_places(
         function, opaque, passing, table, distant, seed, places.place, places.tint, places.gloss, share_rays, found,
         through,
@@ -105,6 +127,6 @@ def direct_at(snapshot: SceneSnapshot, shadows: Shadows, places: Places, seed: i
         rows = np.flatnonzero(through)
         origin, end = places.place[rows, :3], table[through[rows] - 1, :3]
         direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
-        found[rows] *= transmittance(snapshot, shadows.passing, origin, direction, limit)
+        found[rows] *= shadows.crossing(snapshot, origin, direction, limit)[:, None]
     if places.order is not None:
         out[places.order] = found

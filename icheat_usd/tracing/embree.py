@@ -269,10 +269,10 @@ class EmbreeTracer:
             self._instance_mesh,
         )
 
-    def occluded_function(self) -> tuple[int, int]:
-        """Addresses of ``rtcOccluded16`` and of the scene, for compiled loops that make shadow rays themselves."""
+    def address_of(self, function: str) -> tuple[int, int]:
+        """Addresses of one of Embree's functions and of the scene, for compiled loops that make their own rays."""
         self._require_open()
-        return _address("rtcOccluded16"), self._scene
+        return _address(function), self._scene
 
     def _require_open(self) -> None:
         if not self._scene:

@@ -1,0 +1,129 @@
+"""How much light crosses surfaces that let some of it straight through, one ray after another in compiled code."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.bsdf import dielectric_reflectance
+from icheat_usd.kernels.embree import call_1
+from icheat_usd.kernels.surface import OPACITY, corner, corner_pair, mixed, rescaled, texel_sum, unit
+from icheat_usd.kernels.vector import dot, normalized, transform_normal
+
+_BLOCK = 64
+_MAX_LAYERS = 256  # more count as opaque
+_INVALID = np.uint32(0xFFFFFFFF)
+# A surface is left behind by 2^-17 of its largest coordinate, twice what other rays start off it.
+_STEP = 2.0**-17
+
+
+@kernel
+def _opacity(
+    m: int, triangle: int, weights: tuple[float, float, float], st: np.ndarray, opacities: np.ndarray,
+    texture: np.ndarray, transform: np.ndarray, channel: np.ndarray, scale: np.ndarray, bias: np.ndarray,
+    texels: np.ndarray, begin: np.ndarray, width: np.ndarray, height: np.ndarray, wrap: np.ndarray,
+) -> float:  # fmt: skip
+    image = np.int64(texture[m, OPACITY])
+    if image < 0:
+        return unit(np.float64(opacities[m]))
+    s, t = corner_pair(st, triangle, weights)
+    s2 = transform[m, OPACITY, 0, 0] * s + transform[m, OPACITY, 0, 1] * t + transform[m, OPACITY, 0, 2]
+    t2 = transform[m, OPACITY, 1, 0] * s + transform[m, OPACITY, 1, 1] * t + transform[m, OPACITY, 1, 2]
+    texel = texel_sum(texels, begin, width, height, wrap, image, s2, t2)
+    return unit(np.float64(rescaled(texel, channel, scale, bias, m, OPACITY)[0]))
+
+
+@parallel_kernel
+def cross_layers(
+    function: int,
+    scene: int,
+    mesh_begin: np.ndarray,
+    instance_mesh: np.ndarray,
+    geometry: tuple,
+    materials: tuple,
+    textures: tuple,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    limit: float,
+    out: np.ndarray,
+) -> None:
+    """Share of light that crosses each segment, as `tracing.transmittance`.
+
+    `function` is the address of rtcIntersect1, `scene` that of the triangles that may let light through.
+    """
+    material, st, normals = geometry.material, geometry.st, geometry.normals
+    to_object = geometry.instance_to_object
+    opacities, thresholds, iors = materials.opacity, materials.opacity_threshold, materials.ior
+    texture, transform = materials.texture, materials.texture_transform
+    channel, scale, bias = materials.texture_channel, materials.texture_scale, materials.texture_bias
+    texels, begin, width, height, wrap = (
+        textures.texels,
+        textures.begin,
+        textures.width,
+        textures.height,
+        textures.wrap,
+    )
+    n = len(origin)
+    for block in prange((n + _BLOCK - 1) // _BLOCK):
+        storage = np.empty(64, np.float32)
+        shift = np.int64((-storage.ctypes.data % 64) // 4)
+        ray = storage[shift : shift + 24]
+        words = ray.view(np.uint32)
+        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
+            near = 0.0
+            left = 1.0
+            layer = 0
+            d = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
+            length = math.sqrt(dot(d, d))
+            while left > 0.0 and length > 0.0:
+                for c in range(3):
+                    ray[c] = origin[i, c]
+                    ray[4 + c] = direction[i, c]
+                ray[3] = near
+                ray[7] = 0.0
+                ray[8] = limit
+                words[9] = _INVALID
+                words[10] = 0
+                words[11] = 0
+                words[17] = _INVALID
+                words[18] = _INVALID
+                words[19] = _INVALID
+                call_1(function, scene, ray.ctypes.data)
+                if words[18] == _INVALID:
+                    break
+                instance = np.int64(words[18] if words[19] == _INVALID else words[19])
+                triangle = np.int64(mesh_begin[instance_mesh[instance]]) + np.int64(words[17])
+                u, v = np.float64(ray[15]), np.float64(ray[16])
+                weights = (1.0 - u - v, u, v)
+                m = np.int64(material[triangle])
+                opacity = _opacity(
+                    m, triangle, weights, st, opacities, texture, transform, channel, scale, bias, texels, begin,
+                    width, height, wrap,
+                )  # fmt: skip
+                ior = np.float64(iors[m])
+                if thresholds[m] > 0.0:
+                    left *= 0.0 if opacity >= thresholds[m] else 1.0
+                elif opacity > 0.0:
+                    left *= 1.0 - opacity
+                elif ior != 1.0 and ior > 0.0:
+                    mean = mixed(
+                        corner(normals, triangle, 0),
+                        corner(normals, triangle, 1),
+                        corner(normals, triangle, 2),
+                        weights,
+                    )
+                    normal = normalized(transform_normal(to_object, instance, mean))
+                    left *= 1.0 - dielectric_reflectance(abs(dot(normal, d)) / length, 1.0 / ior)[0]
+                largest = 0.0
+                for c in range(3):
+                    largest = max(largest, abs(np.float64(origin[i, c]) + ray[8] * d[c]), abs(np.float64(origin[i, c])))
+                near = np.float64(ray[8]) + _STEP * largest / length
+                layer += 1
+                if layer >= _MAX_LAYERS:
+                    left = 0.0
+                if near >= limit:
+                    break
+            out[i] = left
