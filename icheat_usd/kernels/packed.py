@@ -42,7 +42,7 @@ from icheat_usd.kernels.simd import (
 LANES = 64  # rows of a tile: four vectors of sums for each of three channels stay in registers
 _PARTS = 32  # runs of equal work: threads take equal shares of the parts, one behind the other
 _LARGEST_WORD = 32767.0
-_LARGEST_SUM = 2.0**31 / 128 * (1 - 1e-4)  # of the sizes of a tile's words: no sum with quanta overflows 32 bits
+_LARGEST_SUM = 2.0**31 / 128 * (1 - 1e-3)  # of the sizes of a tile's words: no sum with quanta overflows 32 bits
 
 
 class PairedTiles(NamedTuple):
