@@ -97,7 +97,18 @@ class Parts:
 
     @cached_property
     def lights(self) -> LiveLights:
-        return LiveLights(self.snapshot, self.tracer, self.view, self.gather, self.bounces)
+        quality = self.effort.settings()
+        return LiveLights(
+            self.snapshot,
+            self.tracer,
+            self.view,
+            self.gather,
+            self.bounces,
+            n_bounces=quality.n_bounces,
+            light_samples=quality.light_samples,
+            dome_samples=quality.dome_samples,
+            seed=quality.seed,
+        )
 
     @cached_property
     def live(self) -> LiveRelighter:
