@@ -532,6 +532,26 @@ def clamp_samples(samples, light):  # type: ignore[no-untyped-def]
             light[samples[k], c] = max(light[samples[k], c], np.float32(0))
 
 
+@parallel_kernel
+def multiply_edited_rows(begin, cell, weight, factor, emission, b, out):  # type: ignore[no-untyped-def]
+    """``out[row] = sum of weight (sum_g factor_g b_g + emission)`` over the entries of each row, (n_rows, 4)."""
+    for row in prange(len(out)):
+        _multiply_edited_row(begin[row], begin[row + 1], cell, weight, factor, emission, b, out[row])
+
+
+@kernel
+def _multiply_edited_row(first, end, cell, weight, factor, emission, b, out):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        total = np.float32(0)
+        for k in range(first, end):
+            light = emission[k, c]
+            for g in range(len(b)):
+                light += factor[g, k, c] * b[g, cell[k], c]
+            total += weight[k] * light
+        out[c] = total
+    out[3] = np.float32(0)
+
+
 @kernel
 def mark_pairs(samples, group, term_begin, term_version, sparse, indptr, indices, needed):  # type: ignore[no-untyped-def]
     """Set ``needed[version, tile]`` for every term of every sample; `sparse` is 0 where rows are samples."""

@@ -20,6 +20,7 @@ from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
 
 _BLENDS = {Blend.COMPOSE: kernels.COMPOSE, Blend.OVER: kernels.OVER, Blend.ADD: kernels.ADD}
+_IDENTITY = np.array([[1.0] * 3 + [0.0] * 6])
 _NOWHERE = PairEnd(*(np.zeros((1, 3), np.float32),) * 3)
 
 
@@ -29,7 +30,8 @@ class Way(IntEnum):
     VERSION = 0  #: receivers share edited copies of the casters' radiance
     AGGREGATE = 1  #: they do, and each makes something of its own of the sum
     VIEW = 2  #: at the end
-    ALONE = 3  #: pair by pair
+    ALONE = 3  #: sample by sample and pair by pair
+    PAIRS = 4  #: versions, multiplied pair by pair at the records
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,7 @@ class CompiledStack:
     way: I64  #: (n_rows,) `Way`
     edit_of: I64  #: (n_members,)
     looks: Bool  #: (n_rows,) the coefficients depend on the light that weaker edits left
+    gives_offset: Bool  #: (n_rows,) whether it may add light that does not come by the transport
     row_table: I64  #: (n_rows, 5) see `kernels.versions.compose`
     row_amount: F64  #: (n_rows,) amount times key weight
     groups: U8  #: (n_edits, G) groups of lights
@@ -72,6 +75,11 @@ class CompiledStack:
             return member
         return int(np.flatnonzero(self.row_table[:, 4] == member)[0])
 
+    def rows_of(self, edit: int) -> range:
+        """Rows of an edit of the field."""
+        first, end = np.searchsorted(self.row_table[:, 0], (edit, edit + 1))
+        return range(int(first), int(end))
+
     def slots_of(self, row: int) -> F64:
         """Numbers of a row, to be read or written."""
         return self.slots[self.slot_begin[row] : self.slot_begin[row + 1]]
@@ -99,15 +107,19 @@ class CompiledStack:
         )
 
 
-def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) -> CompiledStack:
+def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32, at_records: bool = True) -> CompiledStack:
     """Write a bound stack as tables.
 
     Parameters
     ----------
     caster_masks : (n_rows, n_gather) of `EditField.casters`
+    at_records
+        Edits that look at receivers may look at records instead.
     """
     rows = [(edit, bound, key) for edit, bound in enumerate(field.edits) for key in range(bound.n_keys)]
     way = np.array([_way(bound) for _, bound, _ in rows], np.int64)
+    if not at_records:
+        way[way == Way.PAIRS] = Way.ALONE
     aggregates = np.flatnonzero(way == Way.AGGREGATE)
     table = np.full((len(rows), 5), -1, np.int64)
     for row, (edit, bound, _) in enumerate(rows):
@@ -118,7 +130,7 @@ def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) ->
     instance = gather.points.instance
     on_instances = np.zeros((len(rows), max(int(instance.max(initial=0)) + 1, 1)), np.bool_)
     for row, (_, bound, key) in enumerate(rows):
-        if way[row] in (Way.VERSION, Way.AGGREGATE):
+        if way[row] in (Way.VERSION, Way.AGGREGATE, Way.PAIRS):
             on_instances[row] = bound.casters[key].on_instances[: on_instances.shape[1]] > 0
     support = on_instances[:, np.maximum(instance, 0)] & (instance >= 0)
     cells = [np.flatnonzero(there) for there in support]
@@ -134,6 +146,7 @@ def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32) ->
         way,
         edit_of,
         np.array([bound.operation is not None and bound.operation.uses_incident for _, bound, _ in rows], np.bool_),
+        np.array([_gives_offset(bound, key) for _, bound, key in rows], np.bool_),
         table,
         np.array([np.float64(bound.edit.amount * bound.key_weights[key]) for _, bound, key in rows], np.float64),
         np.array([bound.groups for bound in field.edits], np.uint8).reshape(len(field.edits), field.n_groups),
@@ -159,9 +172,18 @@ def _way(bound: BoundEdit) -> Way:
     if bound.level is Level.AGGREGATE:
         return Way.AGGREGATE if bound.edit.blend is Blend.COMPOSE else Way.ALONE
     if operation is None:
-        return Way.ALONE if any(rows is not None for rows in bound.rows) else Way.VERSION
+        if any(rows is not None and rows.has_offset for rows in bound.rows):
+            return Way.ALONE
+        return Way.PAIRS if any(rows is not None for rows in bound.rows) else Way.VERSION
     other_incident = operation.uses_incident and type(operation) is not Hsv
-    return Way.ALONE if operation.uses_receiver or operation.has_through or other_incident else Way.VERSION
+    if operation.has_through or (operation.has_offset and (operation.uses_receiver or other_incident)):
+        return Way.ALONE
+    return Way.PAIRS if operation.uses_receiver or other_incident else Way.VERSION
+
+
+def _gives_offset(bound: BoundEdit, key: int) -> bool:
+    baked = bound.baked[key]
+    return bound.operation.has_offset if bound.operation is not None else baked is not None and baked.offset is not None
 
 
 def _slots(
@@ -171,7 +193,7 @@ def _slots(
     parts: list[F64] = []
     slot, begin, n = [np.empty(0, np.int64)], [0], 0
     for row, (_, bound, key) in enumerate(rows):
-        part = numbers_of(bound, key, gather, cells[row]) if way[row] == Way.VERSION else np.zeros((1, 9))
+        part = numbers_of(bound, key, gather, cells[row]) if way[row] == Way.VERSION else _IDENTITY
         slot.append(n + (np.arange(len(cells[row])) if len(part) > 1 else np.zeros(len(cells[row]), np.int64)))
         parts.append(part)
         n += len(part)

@@ -57,9 +57,10 @@ def group_terms(compiled: CompiledStack, whole: Sequence[int], soft: Sequence[in
     aggregates = sorted(row for row in touching if way[row] == Way.AGGREGATE)
     if any(way[row] == Way.ALONE for row in touching):
         return GroupTerms(alone=True)
-    hard = tuple(sorted(row for row in whole if way[row] == Way.VERSION and _meets(compiled, (row,))))
-    varying = [row for row in soft if way[row] == Way.VERSION] + aggregates
-    if _looks_at_soft(compiled, touching, varying):
+    by_version = {Way.VERSION, Way.PAIRS}
+    hard = tuple(sorted(row for row in whole if way[row] in by_version and _meets(compiled, (row,))))
+    varying = [row for row in soft if way[row] in by_version] + aggregates
+    if _looks_at_soft(compiled, touching, varying) or _changes_offset(compiled, touching):
         return GroupTerms(alone=True)
     members = sorted(varying + [int(compiled.row_table[row, 4]) for row in aggregates], key=_order(compiled))
     light = _terms(compiled, hard, members, -1)
@@ -85,10 +86,23 @@ def _meets(compiled: CompiledStack, members: Sequence[int]) -> bool:
 def _looks_at_soft(compiled: CompiledStack, touching: Sequence[int], varying: Sequence[int]) -> bool:
     """Whether an edit looks at light that a weaker one leaves in an amount of each sample's own."""
     for row in touching:
-        if compiled.looks[row] and compiled.way[row] == Way.VERSION and compiled.row_table[row, 2] == COMPOSE:
+        if compiled.looks[row] and compiled.way[row] != Way.AGGREGATE and compiled.row_table[row, 2] == COMPOSE:
             for below in varying:
                 if compiled.edit_of[below] < compiled.edit_of[row] and _meets(compiled, (row, below)):
                     return True
+    return False
+
+
+def _changes_offset(compiled: CompiledStack, touching: Sequence[int]) -> bool:
+    """Whether an edit that looks at receivers lies over an offset, which does not come by rows of the transport."""
+    for row in touching:
+        for below in touching if compiled.way[row] == Way.PAIRS else ():
+            if (
+                compiled.gives_offset[below]
+                and compiled.edit_of[below] < compiled.edit_of[row]
+                and _meets(compiled, (row, below))
+            ):
+                return True
     return False
 
 

@@ -17,6 +17,7 @@ from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.groups import SampleGroups, TermTable
 from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
+from icheat_usd.relight.pair_products import PairProducts
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.relighter import RelitView
 from icheat_usd.relight.shared_light import SharedLight
@@ -82,7 +83,7 @@ class LiveRelighter:
         self._own: F32 = np.zeros((view.n, 3), np.float32)  # of samples that do not share their light with a group
         self._lights_seen: Any = None
         self._light_stale = True
-        self._stack = LiveStack(snapshot, view, gather)
+        self._stack = LiveStack(snapshot, view, gather, True)
         self._history: History | None = None
         self.set_transport(transport)
 
@@ -97,6 +98,10 @@ class LiveRelighter:
                 )
         self.transport = transport
         self._products = Products(transport, self.gather.tree)
+        exact = transport.source if isinstance(transport, PackedTransport) else transport
+        self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
+        # Uncompressed means exact: what is interpolated is then the transport alone, not what edits make of it.
+        self._stack.set_at_records(isinstance(transport, PackedTransport) or transport.interpolation is None)
         self._regroup()
 
     def set_stack(self, stack: EditStack) -> None:
@@ -241,14 +246,18 @@ class LiveRelighter:
             self._changed_samples.append(change.samples)
             self._samples_of.clear()
             self._place(change.samples)
-        elif self._stack.active_rows != self._active_rows:
+        elif (self._stack.active_rows != self._active_rows).any():
             self._find_touched()
 
     def _regroup(self) -> None:
         """Find anew which samples share what."""
         stack = self._stack
+        if self._pair_products is None and (stack.compiled.way == Way.PAIRS).any():
+            raise EditError("the stack has edits that look at receivers, which needs exact rows; build them again")
+        if self._pair_products is not None:
+            self._pair_products.forget()
         self._groups = SampleGroups(stack.compiled, self.view.n)
-        self._versions = Versions(stack.compiled, self._products, self.gather.area)
+        self._versions = Versions(stack.compiled, self._products, self._pair_products, self.gather.area)
         self._terms = TermTables(stack.compiled, self._groups, self._versions)
         self._shared = SharedLight(self._products, self.view.n)
         self._changed_rows: set[int] = set()
@@ -291,7 +300,7 @@ class LiveRelighter:
     def _find_touched(self) -> None:
         """Which samples the edits that are not muted touch; the others keep their unedited light, bit for bit."""
         self._active_rows = self._stack.active_rows
-        self._touched = self._touched_by(self._active_rows)
+        self._touched = self._touched_by(np.flatnonzero(self._active_rows))
         self._mixed_samples = np.flatnonzero(self._mixed)
         self._shared_samples = np.flatnonzero(self._touched & ~self._mixed)
 

@@ -17,7 +17,7 @@ from icheat_usd.errors import EditError
 from icheat_usd.relight.compiled import CompiledStack, Way, compile_stack, numbers_of
 from icheat_usd.relight.painted import PaintedPoints
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, I64, Bool, SceneSnapshot, SurfacePoints
 
 #: Sides of an edit: fields of a payload.
 RECEIVERS, CASTERS = "receiver_mask", "caster_mask"
@@ -48,8 +48,9 @@ class LiveStack:
     them on and off changes numbers and no structure.
     """
 
-    def __init__(self, snapshot: SceneSnapshot, view: ViewSamples, gather: GatherSamples) -> None:
+    def __init__(self, snapshot: SceneSnapshot, view: ViewSamples, gather: GatherSamples, at_records: bool) -> None:
         self._snapshot, self._view, self._gather = snapshot, view, gather
+        self._at_records = at_records
         self.light_paths = snapshot.light_paths
         self._show(EMPTY_STACK, self._bind(EMPTY_STACK, self.light_paths), self.light_paths)
 
@@ -61,11 +62,10 @@ class LiveStack:
     light_paths: tuple[str, ...]
 
     @property
-    def active_rows(self) -> list[int]:
-        """Rows of the edits that are not muted."""
-        return [
-            row for edit, bound in enumerate(self.field.edits) if bound.edit.amount != 0 for row in self._rows(edit)
-        ]
+    def active_rows(self) -> Bool:
+        """(n_rows,) which rows belong to edits that are not muted."""
+        active = np.array([bound.edit.amount != 0 for bound in self.field.edits], np.bool_)
+        return active[self.compiled.row_table[:, 0]]
 
     def set_stack(self, stack: EditStack, light_paths: tuple[str, ...]) -> Change | None:
         """Take another stack; what changed, or None if the structure is another one."""
@@ -104,6 +104,12 @@ class LiveStack:
         edits = tuple(now if edit.path == now.path else edit for edit in self.stack.edits)
         return self.set_stack(replace(self.stack, edits=edits, digest=""), self.light_paths)
 
+    def set_at_records(self, at_records: bool) -> None:
+        """Say whether edits that look at receivers may look at the records of the transport instead."""
+        if at_records != self._at_records:
+            self._at_records = at_records
+            self._show(self.stack, self.field, self.light_paths)
+
     # Binding ----------------------------------------------------------------------------------------------------------
 
     def _bind(self, stack: EditStack, light_paths: tuple[str, ...]) -> EditField:
@@ -123,7 +129,7 @@ class LiveStack:
     def _show(self, stack: EditStack, field: EditField, light_paths: tuple[str, ...]) -> None:
         receivers = field.receivers(self._view.points).masks
         casters = field.casters(self._gather.points).masks
-        compiled = compile_stack(field, self._gather, casters)
+        compiled = compile_stack(field, self._gather, casters, self._at_records)
         self.stack, self.field, self.light_paths, self.compiled = stack, field, light_paths, compiled
         self.receiver_masks = np.ascontiguousarray(receivers)
         self.caster_masks = np.ascontiguousarray(casters)
@@ -215,8 +221,7 @@ class LiveStack:
         return replace(bound, casters=tuple(selections)), found, weights
 
     def _rows(self, edit: int) -> range:
-        rows = self.field.rows_of(edit)
-        return range(rows.start, rows.stop)
+        return self.compiled.rows_of(edit)
 
 
 def _is_active(stack: EditStack, edit: Edit) -> bool:

@@ -9,9 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
-from icheat_usd.relight.compiled import CompiledStack
+from icheat_usd.relight.compiled import CompiledStack, Way
+from icheat_usd.relight.pair_products import PairProducts, PairSum
 from icheat_usd.relight.products import Products, VersionTables
 from icheat_usd.scene import F32, F64, I32, I64, U8
+from icheat_usd.transport.packed import LANES
 
 #: Casters of a version that are evaluated in one piece.
 _PIECE = 2048
@@ -34,6 +36,7 @@ class _Version(NamedTuple):
     sets: U8  #: (n_sets, n_members)
     sign: F64
     rows: frozenset[int]  #: of the stack, on which it depends
+    by_pairs: bool  #: multiplied pair by pair
 
 
 class Versions:
@@ -43,8 +46,8 @@ class Versions:
     for; values do not.
     """
 
-    def __init__(self, compiled: CompiledStack, products: Products, area: F32) -> None:
-        self._compiled, self._products, self._area = compiled, products, area
+    def __init__(self, compiled: CompiledStack, products: Products, pairs: PairProducts | None, area: F32) -> None:
+        self._compiled, self._products, self._pair_products, self._area = compiled, products, pairs, area
         self._number: dict[VersionKey, int] = {}
         self._versions: list[_Version] = []
         self._tables: VersionTables | None = None
@@ -78,7 +81,10 @@ class Versions:
         changed = set(rows)
         if changed:
             self._changed_rows[1 + np.array(sorted(changed))] = 1
-            self._stale |= {v for v, version in enumerate(self._versions) if version.rows & changed}
+            stale = {v for v, version in enumerate(self._versions) if version.rows & changed}
+            self._stale |= stale
+            if self._pair_products is not None:
+                self._pair_products.stack_changed(stale)
 
     def light_changed(self, b: F32) -> None:
         """Take other light, (G, n_gather, 3)."""
@@ -102,6 +108,7 @@ class Versions:
         order = np.argsort(self._pair_version, kind="stable")
         ends = np.searchsorted(self._pair_version[order], np.arange(self.n + 1))
         self._pairs_of = [order[ends[v] : ends[v + 1]].astype(np.int64) for v in range(self.n)]
+        self._stale |= {v for v in set(version.tolist()) if self._versions[v].by_pairs}
         # Those whose version is evaluated anyway are multiplied then.
         fresh = np.arange(first, len(self._pair_tile))
         done = ~np.isin(self._pair_version[fresh], list(self._stale))
@@ -145,11 +152,31 @@ class Versions:
         if compiled.field.has_offset:
             self.offsets[stale] = 0
             np.add.at(self.offsets, pieces[:, 0], sums)
-        self._products.prepare(stale, tables, self._deltas)
-        pairs = np.concatenate([np.empty(0, np.int64), *(self._pairs_of[v] for v in stale if v < len(self._pairs_of))])
+        plain = np.array([v for v in stale if not self._versions[v].by_pairs], np.int64)
+        self._products.prepare(plain, tables, self._deltas)
+        pairs = np.concatenate([np.empty(0, np.int64), *(self._pairs_of[v] for v in plain)])
         self._products.multiply(pairs, self._pair_tile, self._pair_version, self.values)
+        for v in stale:
+            if self._versions[v].by_pairs:
+                self._multiply_by_pairs(int(v))
         self._stale = set()
         self._changed_rows[:] = 0
+
+    def _multiply_by_pairs(self, v: int) -> None:
+        assert self._pair_products is not None and self._light is not None
+        version, pairs = self._versions[v], self._pairs_of[v]
+        key = version.key
+        unedited = not key.differ and key.restrict < 0
+        out = np.zeros((len(self.values), len(pairs), LANES, 4), np.float32)
+        self._pair_products.products(
+            v,
+            PairSum(version.sets, version.sign, key.restrict, unedited, version.cells),
+            self._compiled,
+            self._pair_tile[pairs].astype(np.int64),
+            self._light,
+            out,
+        )
+        self.values[:, pairs] = out
 
     def _made(self, key: VersionKey) -> _Version:
         compiled = self._compiled
@@ -168,8 +195,10 @@ class Versions:
         # A new version knows nothing yet: it has to be evaluated at all of its cells.
         self._changed_rows[0] = 1
         self._stale.add(len(self._versions))
-        nodes, child = self._products.nodes(cells)
-        return _Version(key, cells, nodes, child, sets, sign, frozenset((*key.whole, *inner)))
+        rows = frozenset((*key.whole, *inner))
+        by_pairs = any(compiled.way[row] == Way.PAIRS for row in rows)
+        nodes, child = self._products.nodes(cells if not by_pairs else cells[:0])
+        return _Version(key, cells, nodes, child, sets, sign, rows, by_pairs)
 
     def _arrange(self) -> None:
         if self._tables is not None:

@@ -7,16 +7,19 @@ import functools
 from dataclasses import replace
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
-from icheat_usd.edits.model import Edit, EditStack, SurfaceMask
+from icheat_usd.edits.model import Edit, EditStack, KeyedPayload, SurfaceMask
 from icheat_usd.errors import EditError
 from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.scene import F32
 from icheat_usd.transport import sum_lights
-from tests.pipeline import Pipeline
-from tests.relight.test_operations import MIXED, PARAMETERS, edit, pipeline, soft, stacks
+from icheat_usd.transport.packed import PackedLobe, PackedTransport
+from icheat_usd.transport.packing import lossless
+from tests.pipeline import Pipeline, select
+from tests.relight.test_operations import MIXED, PARAMETERS, baked, edit, pipeline, soft, soft_mask, stacks
 
 
 class StillLights:
@@ -141,3 +144,64 @@ def test_the_same_state_has_the_same_bits_whatever_led_to_it(operations):
     np.testing.assert_array_equal(shown.frame(), again.frame())
     for found, expected in zip(shown.relit(), again.relit(), strict=True):
         np.testing.assert_array_equal(found, expected)
+
+
+def test_baked_rows_equal_the_exact_relighter():
+    of = pipeline("full")
+    payloads = [baked("falloff", select("/red", "/ceiling")), baked("direction", select("/red", "/green"))]
+    keys = tuple(KeyedPayload(payload, 0.5) for payload in payloads)
+    unknown = Edit("/baked", "theirs", {}, select("/floor", "/back"), select("/red", "/green", "/ceiling"), keys=keys)
+    assert_equals_the_exact_relighter("full", (edit("warm", "scale"), unknown, edit("turn", "hsv")))
+
+
+@functools.cache
+def packed(kind: str) -> PackedTransport:
+    """All coefficients of all rows, in floats."""
+    of = pipeline(kind)
+    exact = of.transport
+    lobes = tuple(PackedLobe(lobe.name, lossless(lobe.rows, of.gather.tree), lobe.tint) for lobe in exact.lobes)
+    return PackedTransport(lobes, exact.row_view, exact.interpolation, exact)
+
+
+@pytest.mark.parametrize("operation", ["scale", "falloff", "gamma", "paint"])
+def test_wavelets_that_lose_nothing_change_nothing(operation):
+    of = pipeline("full")
+    edits = stacks(operation)["strongest, on soft places"]
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, packed("full"), StillLights(of))
+    shown.set_stack(EditStack("/stack", edits))
+    expected = of.relighter.relight(of.field(*edits))
+    np.testing.assert_allclose(shown.relit().indirect_edited, expected.indirect_edited, rtol=1e-4, atol=2e-6)
+    shown.set_transport(of.transport)
+    np.testing.assert_array_equal(shown.frame(), fresh(of, EditStack("/stack", edits), np.ones((2, 3))).frame())
+
+
+def test_one_thread_has_the_bits_of_two():
+    of = pipeline("full")
+    edits = (edit("a", "scale"), soft("b", "gamma", "/floor", "/red", 1), edit("c", "falloff"), edit("d", "paint"))
+    found = []
+    for n in (1, 2):
+        before = numba.get_num_threads()
+        numba.set_num_threads(min(n, before))
+        try:
+            found.append(fresh(of, EditStack("/stack", edits), np.ones((2, 3))).frame())
+        finally:
+            numba.set_num_threads(before)
+    np.testing.assert_array_equal(*found)
+
+
+def test_mistakes_are_told():
+    of = pipeline("full")
+    stack = EditStack("/stack", (soft("a", "scale", "/floor", "/red", 1),))
+    shown = fresh(of, stack, np.ones((2, 3)))
+    for command, message in (
+        (lambda: shown.set_amount("/b", 1.0), "no edit /b"),
+        (lambda: shown.set_amount("/a", float("nan")), "finite"),
+        (lambda: shown.dab("/a", "lights", soft_mask("/floor", 1)), "'lights' cannot be painted"),
+        (lambda: shown.dab("/a", "receivers", soft_mask("/floor", 1), key=2), "no painted key 2"),
+        (lambda: shown.reorder(["/a", "/a"]), "names each of /a once"),
+        (lambda: shown.undo(), "nothing to undo"),
+        (lambda: shown.redo(), "nothing to redo"),
+    ):
+        with pytest.raises(EditError, match=message):
+            command()
+    assert shown.stack is stack
