@@ -55,8 +55,9 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
 
 def _tables(results: list[dict[str, Any]]) -> list[str]:
     lines = [
-        "| stage, light | compression and interpolation | total | at rest | largest pixel | cells against true hits |",
-        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        "| stage, light | compression and interpolation | total | while it moves | at rest | largest pixel"
+        " | cells against true hits |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     found = {result["case"]["name"]: result["result"] for result in results if "result" in result}
     for stage, result in found.items():
@@ -65,14 +66,14 @@ def _tables(results: list[dict[str, Any]]) -> list[str]:
             hits = result.get("cells_against_true_hits", {}).get(name)
             lines.append(
                 f"| {stage}, {name} | {_percent(lossy)} | {_percent(light['total'])} |"
-                f" {_percent(light['at_rest'])} |"
+                f" {_percent(light['while_moving'])} | {_percent(light['at_rest'])} |"
                 f" {100 * light['total']['largest']:.0f} % | {_percent(hits)} |"
             )
     if found:
         figures = overview(found)
         lines.append(
             f"| median; worst | {_both(figures, 'interpolation_and_packing')} | {_both(figures, 'total')} |"
-            f" {_both(figures, 'at_rest')} | | |"
+            f" {_both(figures, 'while_moving')} | {_both(figures, 'at_rest')} | | |"
         )
     lines += ["", "| stage, edit | of the unedited light | error of the change |", "| --- | ---: | ---: |"]
     for stage, result in found.items():

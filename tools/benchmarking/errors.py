@@ -71,6 +71,7 @@ def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -
     """All errors of one scene under the lights of its snapshot; images go to `folder`."""
     names = [path.rpartition("/")[2] for path in parts.snapshot.light_paths]
     started = time.perf_counter()
+    just_made = parts.lights.radiance.copy()  # as while a light moves: a change shows with few samples at first
     parts.refine_lights()
     references = converged_references(parts, settings)
     found: dict[str, Any] = {
@@ -81,6 +82,9 @@ def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -
     }
     for light, name in enumerate(names):
         found["lights"][name] = _of_light(parts, references, light)
+        image = references.probe.to_pixels(parts.packed.to_view(just_made[light])[references.probe.samples])
+        moving = relative_error(image, references.own_b[0][light], references.own_b[1][light])
+        found["lights"][name]["while_moving"] = moving.as_dict()
     for name, error in _interpolation(parts, references, settings, names):
         found["lights"][name] |= error
     found["edits"] = _of_edits(parts, references, settings)
@@ -343,6 +347,7 @@ def overview(found: dict[str, Any]) -> dict[str, float]:
     for kind in (
         "total",
         "at_rest",
+        "while_moving",
         "unpacked",
         "transport",
         "packing",
