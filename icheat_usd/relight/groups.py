@@ -97,11 +97,8 @@ def _changes_offset(compiled: CompiledStack, touching: Sequence[int]) -> bool:
     """Whether an edit that looks at receivers lies over an offset, which does not come by rows of the transport."""
     for row in touching:
         for below in touching if compiled.way[row] == Way.PAIRS else ():
-            if (
-                compiled.gives_offset[below]
-                and compiled.edit_of[below] < compiled.edit_of[row]
-                and _meets(compiled, (row, below))
-            ):
+            weaker = compiled.edit_of[below] < compiled.edit_of[row]
+            if weaker and compiled.gives_offset[below] and _meets(compiled, (row, below)):
                 return True
     return False
 

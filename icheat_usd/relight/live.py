@@ -100,6 +100,10 @@ class LiveRelighter:
         self._products = Products(transport, self.gather.tree)
         exact = transport.source if isinstance(transport, PackedTransport) else transport
         self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
+        self._exact_products: Products | None = None
+        self._is_exact = False
+        if exact is not None and exact is not transport:
+            self._exact_products = Products(exact, self.gather.tree, self._products.names)
         # Uncompressed means exact: what is interpolated is then the transport alone, not what edits make of it.
         self._stack.set_at_records(isinstance(transport, PackedTransport) or transport.interpolation is None)
         self._regroup()
@@ -231,8 +235,21 @@ class LiveRelighter:
         return RelitView(self._direct.copy(), self._base.copy(), self._edited.copy())
 
     def refine(self) -> bool:
-        """At rest: bring the lights closer to what they are; False when nothing is left."""
-        return bool(self.lights.refine())
+        """At rest: bring lights to their final quality, then take back what packing lost; False when nothing is left.
+
+        What is reached then depends on lights and stack alone.
+        """
+        if self.lights.refine():
+            return True
+        self._update()
+        if self._exact_products is not None:
+            self._versions.refine(self._exact_products)
+            if not self._is_exact:
+                self._shared.set_unedited(self._by_group.sum(axis=0), self._exact_products)
+                self._shared.unedited(self._base)
+                self._is_exact = True
+            self._show(self._mixed_samples, self._all_pixels)
+        return False
 
     # Structure --------------------------------------------------------------------------------------------------------
 
@@ -340,16 +357,21 @@ class LiveRelighter:
             self._direct = np.ascontiguousarray(self.lights.direct(), np.float32)
             self._by_group = self._light_by_group(b)
             self._shared.set_unedited(b)
+            self._is_exact = False
             self._shared.unedited(self._base)
             self._versions.light_changed(self._by_group)
             samples, pixels = self._mixed_samples, self._all_pixels
         else:
             samples, pixels = self._changed_places()
         self._versions.update()
-        self._shared.edited(self._terms.light, self._versions, self._edited)
-        self._edit(samples)
+        self._show(samples, pixels)
         self._light_stale = False
         self._changed_rows, self._changed_samples = set(), []
+
+    def _show(self, samples: I64, pixels: I64) -> None:
+        """Put the image together, of which some samples and pixels have changed."""
+        self._shared.edited(self._terms.light, self._versions, self._edited)
+        self._edit(samples)
         kernels.develop_pixels(
             pixels, self._sample_begin, self._still, self._throughput, self._direct, self._edited, self._film
         )

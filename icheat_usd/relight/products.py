@@ -35,9 +35,14 @@ class VersionTables(NamedTuple):
 class Products:
     """One transport, and what each version of the light is in the basis of its rows."""
 
-    def __init__(self, transport: Transport | PackedTransport, tree: ClusterTree) -> None:
+    def __init__(
+        self, transport: Transport | PackedTransport, tree: ClusterTree, names: tuple[str, ...] | None = None
+    ) -> None:
         # A lobe that no view sample has holds no rows and costs nothing.
-        lobes: list[Any] = [lobe for lobe in transport.lobes if _n_entries(lobe.rows)]
+        lobes: list[Any] = [
+            lobe for lobe in transport.lobes if (_n_entries(lobe.rows) if names is None else lobe.name in names)
+        ]
+        self.names = tuple(lobe.name for lobe in lobes)
         self._rows = [lobe.rows for lobe in lobes]
         self._haar = isinstance(transport, PackedTransport)
         self._n_leaves = tree.n_leaves
@@ -124,6 +129,14 @@ class Products:
             self._multiply(lobe, self._versions, tile, version, into)
             if not direct:
                 out[lobe, pairs] = into
+
+    def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
+        """Products of some tiles of uncompressed rows with values (n, 3) that are 0 but at some cells."""
+        assert not self._haar
+        leaves = np.zeros((1, self._n_leaves, 4), np.float32)
+        leaves[0, cells, :3] = values
+        for lobe in range(len(self._rows)):
+            self._multiply(lobe, leaves, tile, np.zeros_like(tile), out[lobe])
 
     def multiply_all(self, b: F32, out: F32) -> None:
         """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``."""

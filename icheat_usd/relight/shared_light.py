@@ -69,9 +69,9 @@ class SharedLight:
         sums[:, : self._sums.shape[1]] = self._sums
         self._sums = sums
 
-    def set_unedited(self, b: F32) -> None:
-        """Multiply the transport with the unedited light (n_gather, 3)."""
-        self._products.multiply_all(b, self._sums)
+    def set_unedited(self, b: F32, products: Products | None = None) -> None:
+        """Multiply the transport, or the `products` of exact rows, with the unedited light (n_gather, 3)."""
+        (products or self._products).multiply_all(b, self._sums)
 
     def unedited(self, out: F32) -> None:
         """Unedited indirect light of all view samples into `out`."""

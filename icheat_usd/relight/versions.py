@@ -53,6 +53,7 @@ class Versions:
         self._tables: VersionTables | None = None
         self._deltas: F32 = np.zeros((0, 3), np.float32)
         self._stale: set[int] = set()
+        self._refined: set[int] = set()
         self._pairs_of: list[I64] = []
         self._light: F32 | None = None
         self.offsets: F64 = np.zeros((0, 6))  #: (n_versions, 6) light without transport: to be reflected, and not
@@ -109,6 +110,7 @@ class Versions:
         ends = np.searchsorted(self._pair_version[order], np.arange(self.n + 1))
         self._pairs_of = [order[ends[v] : ends[v + 1]].astype(np.int64) for v in range(self.n)]
         self._stale |= {v for v in set(version.tolist()) if self._versions[v].by_pairs}
+        self._refined -= set(version.tolist())
         # Those whose version is evaluated anyway are multiplied then.
         fresh = np.arange(first, len(self._pair_tile))
         done = ~np.isin(self._pair_version[fresh], list(self._stale))
@@ -159,8 +161,25 @@ class Versions:
         for v in stale:
             if self._versions[v].by_pairs:
                 self._multiply_by_pairs(int(v))
+        self._refined -= self._stale
         self._stale = set()
         self._changed_rows[:] = 0
+
+    def refine(self, exact: Products) -> None:
+        """Multiply with exact rows what was multiplied with packed ones."""
+        self.update()
+        self._arrange()
+        tables = self._tables
+        assert tables is not None
+        for v, version in enumerate(self._versions):
+            pairs = self._pairs_of[v]
+            if version.by_pairs or v in self._refined or not len(pairs):
+                continue
+            some = slice(tables.cell_begin[v], tables.cell_begin[v + 1])
+            out = exact.room(len(pairs))
+            exact.multiply_cells(tables.cells[some], self._deltas[some], self._pair_tile[pairs], out)
+            self.values[:, pairs] = out
+            self._refined.add(v)
 
     def _multiply_by_pairs(self, v: int) -> None:
         assert self._pair_products is not None and self._light is not None

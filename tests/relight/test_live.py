@@ -147,7 +147,6 @@ def test_the_same_state_has_the_same_bits_whatever_led_to_it(operations):
 
 
 def test_baked_rows_equal_the_exact_relighter():
-    of = pipeline("full")
     payloads = [baked("falloff", select("/red", "/ceiling")), baked("direction", select("/red", "/green"))]
     keys = tuple(KeyedPayload(payload, 0.5) for payload in payloads)
     unknown = Edit("/baked", "theirs", {}, select("/floor", "/back"), select("/red", "/green", "/ceiling"), keys=keys)
@@ -173,6 +172,27 @@ def test_wavelets_that_lose_nothing_change_nothing(operation):
     np.testing.assert_allclose(shown.relit().indirect_edited, expected.indirect_edited, rtol=1e-4, atol=2e-6)
     shown.set_transport(of.transport)
     np.testing.assert_array_equal(shown.frame(), fresh(of, EditStack("/stack", edits), np.ones((2, 3))).frame())
+
+
+def test_refining_takes_back_what_packing_loses():
+    of = pipeline("full")
+    good = packed("full")
+    lobes = tuple(replace(lobe, rows=replace(lobe.rows, value=0.9 * lobe.rows.value)) for lobe in good.lobes)
+    edits = stacks("falloff")["strongest, on soft places"]
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, replace(good, lobes=lobes), StillLights(of))
+    shown.set_stack(EditStack("/stack", edits))
+    expected = of.relighter.relight(of.field(*edits)).indirect_edited
+    assert np.abs(shown.relit().indirect_edited / expected - 1).max() > 0.05
+    while shown.refine():
+        pass
+    np.testing.assert_allclose(shown.relit().indirect_edited, expected, rtol=2e-5, atol=1e-6)
+    refined = shown.frame()
+    shown.set_amount("/op", 0.3)
+    shown.frame()
+    shown.set_amount("/op", 1.0)
+    while shown.refine():
+        pass
+    np.testing.assert_array_equal(shown.frame(), refined)
 
 
 def test_one_thread_has_the_bits_of_two():
