@@ -29,11 +29,12 @@ def multiply_tiles(tile_begin, index, scale, value, coefficients, out):  # type:
 
 
 @kernel
-def smooth_energy(left, right, node_weight, levels, energy, out):  # type: ignore[no-untyped-def]
+def smooth_energy(left, right, node_weight, levels, share_of_all, energy, out):  # type: ignore[no-untyped-def]
     """Energy that a coefficient would have if its surroundings set it.
 
     Per unit of weight, energies are averaged over the subtree below the ancestor
-    `levels` up: light that falls here falls elsewhere nearby in another scene.
+    `levels` up: a light that falls here falls nearby when it is moved. `share_of_all`
+    is taken from the average over the whole tree, since light may fall anywhere.
     """
     n_nodes = len(left)
     parent = np.zeros(n_nodes, np.int64)
@@ -53,7 +54,8 @@ def smooth_energy(left, right, node_weight, levels, energy, out):  # type: ignor
         ancestor = node
         for _ in range(levels):
             ancestor = parent[ancestor]
-        out[1 + node] = total[ancestor] * node_weight[node]
+        density = (1.0 - share_of_all) * total[ancestor] + share_of_all * total[0]
+        out[1 + node] = density * node_weight[node]
 
 
 @kernel

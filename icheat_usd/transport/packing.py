@@ -17,11 +17,12 @@ from icheat_usd.transport.packed import LANES, PackedLobe, PackedRows, PackedTra
 from icheat_usd.transport.sparse import SparseRows
 
 _TILES_AT_ONCE = 16
-_TILES_OF_A_TRIAL = 48  # that the amount to keep is found on; spread over all
+_TILES_OF_A_TRIAL = 32  # that the amount to keep is found on; spread over all
 _TRIALS = 6
 _CLOSE_ENOUGH = 1.05  # ratio of errors at which the search for the amount ends
 _PRIOR = 0.2  # share of the energy that is taken from a coefficient's surroundings: the training lights are few
 _PRIOR_LEVELS = 4  # of ancestors that these surroundings reach up
+_ANYWHERE = 0.1  # share of those that is the same everywhere: no place stays dark for ever
 _UNSEEN = 0.3  # share of the energy that does not go together with that of other coefficients
 _DIM = 0.02  # of its mean on the cells: a light that responds less in the view is not measured relative to that
 
@@ -73,7 +74,7 @@ def pack(
     training : (n_lights, n_gather)
         Radiance that plausible lights make leave the cells.
     tolerance
-        Relative RMS error at the records, RMS over the training lights.
+        Relative RMS error at the records, median over such lights.
     max_bytes
         Stop here even where the tolerance asks for more.
 
@@ -184,7 +185,7 @@ def _energy(tree: ClusterTree, coefficients: F32) -> F64:
         return np.ones(tree.n_leaves)
     seen = np.mean(coefficients.astype(np.float64) ** 2, axis=1)
     around = np.empty_like(seen)
-    kernels.smooth_energy(tree.left, tree.right, tree.node_weight, _PRIOR_LEVELS, seen, around)
+    kernels.smooth_energy(tree.left, tree.right, tree.node_weight, _PRIOR_LEVELS, _ANYWHERE, seen, around)
     return (1 - _PRIOR) * seen + _PRIOR * around
 
 
@@ -226,7 +227,7 @@ def _find_least(
                 squared[others] += share * error
                 size += 0.5 * share * n_kept * (LANES + 8)
         errors = np.sqrt(squared[lit] / total[lit])
-        ratio = max(float(np.sqrt(np.mean(errors**2))) / tolerance, 1e-12)
+        ratio = max(PackingReport(errors).error / tolerance, 1e-12)
         if max_bytes is not None:  # fewer bytes for a larger worth: the same search serves both limits
             ratio = min(ratio, max_bytes / size)
         tried.append((float(np.log(least)), float(np.log(ratio)), errors))
