@@ -17,7 +17,7 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.embree import call_packet
-from icheat_usd.kernels.random import hash_u32, to_unit
+from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
 
 RUN = 64  #: successive places that share shadow rays if that is allowed
 CANDIDATES = 4  #: points of the light that a place looks at
@@ -33,40 +33,40 @@ def _brings(
     table: np.ndarray, k: int, distant: bool, x: float, y: float, z: float, nx: float, ny: float, nz: float,
     gx: float, gy: float, gz: float,
 ) -> float:  # fmt: skip
-    """Cosines over distance squared between a place and point `k`; of a distant light, the cosine."""
+    """Irradiance at a place if all of the light were at point `k`; its colour apart."""
     if distant:
         dx, dy, dz = table[k, 0], table[k, 1], table[k, 2]
         if dx * gx + dy * gy + dz * gz <= _ZERO:
             return _ZERO
-        return max(_ZERO, dx * nx + dy * ny + dz * nz)
+        return max(_ZERO, dx * nx + dy * ny + dz * nz) * table[k, 9]
     dx, dy, dz = table[k, 0] - x, table[k, 1] - y, table[k, 2] - z
     here = dx * nx + dy * ny + dz * nz
     there = -(dx * table[k, 3] + dy * table[k, 4] + dz * table[k, 5])
     if here <= _ZERO or there <= _ZERO or dx * gx + dy * gy + dz * gz <= _ZERO:
         return _ZERO
     square = dx * dx + dy * dy + dz * dz
-    return here * there / (square * square)
+    return here * there / (square * square) * table[k, 9]
 
 
 @kernel
 def _choose(
-    table: np.ndarray, distant: bool, place: np.ndarray, i: int, weight: np.ndarray, seed: int
+    table: np.ndarray, distant: bool, place: np.ndarray, i: int, weight: np.ndarray, seed: int, turn: int
 ) -> tuple[int, float]:
     """Point of the light that place `i` sends its ray to (-1: none), and the mean of what its candidates bring."""
     x, y, z = place[i, 0], place[i, 1], place[i, 2]
     gx, gy, gz = place[i, 3], place[i, 4], place[i, 5]
     nx, ny, nz = place[i, 6], place[i, 7], place[i, 8]
-    # neighbours look at different points, those of a run at all of them in turn
+    # neighbours look at different points, those of a run at all of them, and so does one place in as many turns
     groups = len(table) // CANDIDATES
     word = np.int64(hash_u32(np.uint32(i // RUN) ^ np.uint32(seed)))
-    first = ((i % RUN) * 29 + word) % groups * CANDIDATES
+    first = (((i % RUN) * 29 + word) % groups ^ turn % groups) * CANDIDATES
     total = _ZERO
     for c in range(CANDIDATES):
         weight[c] = _brings(table, first + c, distant, x, y, z, nx, ny, nz, gx, gy, gz)
         total += weight[c]
     if not total > _ZERO:
         return -1, _ZERO
-    left = to_unit(hash_u32(np.uint32(i) ^ np.uint32(0x9E3779B9) ^ np.uint32(seed))) * total
+    left = to_unit(hash_combine(hash_combine(seed, turn), i)) * total
     last = -1
     for c in range(CANDIDATES):
         if weight[c] > _ZERO:
@@ -150,10 +150,12 @@ def light_places(
     table: np.ndarray,
     distant: bool,
     seed: int,
+    turn: int,
     place: np.ndarray,
     tint: np.ndarray,
     gloss: np.ndarray,
     share_rays: bool,
+    row: np.ndarray,
     out: np.ndarray,
     through: np.ndarray,
 ) -> None:
@@ -164,8 +166,11 @@ def light_places(
     function, opaque, passing : addresses of rtcOccluded16 and of the scenes of opaque and of see-through triangles
         (0: there are none)
     table : (m, 12) float32
-        Points of the light: place, normal, radiance times the whole light's area. Distant lights: directions,
-        and radiance times solid angle. m is a multiple of `CANDIDATES`.
+        Points of the light: place, normal, colour, radiance times the whole light's area. Distant lights:
+        directions, and radiance times solid angle. m is a power of two and a multiple of
+        `CANDIDATES`.
+    turn : int
+        Number of the ray of each place: in m / `CANDIDATES` turns a place looks at every point once.
     place : (n, 9) float32
         Origin off the surface, geometric normal, shading normal.
     tint : (n, 3) float32, albedo over pi
@@ -174,6 +179,8 @@ def light_places(
         eye; or no rows: no place has a lobe.
     share_rays : bool
         Rays of a quarter of the places stand for a whole run where all agree: for places in the order of tiles.
+    row : (n,) int32
+        Row of `out` that each place has, all different.
     out : (n, 3) float32, set
     through : (n,) int32, set
         1 + point of the table where only see-through surfaces are in the way, and `out` is what the place would get
@@ -195,7 +202,7 @@ def light_places(
         for first in range(task * task_size, min(n, (task + 1) * task_size), RUN):
             size = min(RUN, n - first)
             for j in range(size):
-                chosen[j], level[j] = _choose(table, distant, place, first + j, weight, seed)
+                chosen[j], level[j] = _choose(table, distant, place, first + j, weight, seed, turn)
                 state[j] = _BLOCKED
             count = 0
             for j in range(size):
@@ -219,10 +226,11 @@ def light_places(
                     )
             for j in range(size):
                 i, k = first + j, chosen[j]
+                target = np.int64(row[i])
                 through[i] = 0
                 if state[j] == _BLOCKED:
                     for c in range(3):
-                        out[i, c] = _ZERO
+                        out[target, c] = _ZERO
                     continue
                 if state[j] == _THROUGH:
                     through[i] = 1 + k
@@ -233,4 +241,4 @@ def light_places(
                     reflects = tint[i, c]
                     if glossy:
                         reflects += gloss[i, c] * base + gloss[i, 3 + c] * edge
-                    out[i, c] = reflects * level[j] * table[k, 6 + c]
+                    out[target, c] = reflects * level[j] * table[k, 6 + c]

@@ -28,8 +28,9 @@ def light_points(snapshot: SceneSnapshot, seed: int) -> tuple[F32, bool]:
     Returns
     -------
     table : (N_POINTS, 12) float32
-        Place, unit normal of the side that shines, radiance times the area that all points stand for; a distant
-        light has directions, and radiance times solid angle (without an angle its radiance is an irradiance).
+        Place, unit normal of the side that shines, colour (of mean 1), and radiance times the area that all points
+        stand for; a distant light has directions, and radiance times solid angle (without an angle its radiance is
+        an irradiance).
     distant : bool
     """
     lights = snapshot.lights
@@ -64,7 +65,9 @@ def light_points(snapshot: SceneSnapshot, seed: int) -> tuple[F32, bool]:
         area = measure * length
     table = np.zeros((N_POINTS, 12), np.float32)
     table[:, :3], table[:, 3:6] = place, normal
-    table[:, 6:9] = color * lights.radiance[0] * area[:, None]
+    shining = color * lights.radiance[0] * area[:, None]
+    table[:, 9] = shining.mean(axis=1)
+    table[:, 6:9] = shining / np.maximum(shining.mean(axis=1), 1e-300)[:, None]
     return table, kind == LightKind.DISTANT
 
 

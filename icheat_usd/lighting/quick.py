@@ -11,7 +11,7 @@ from icheat_usd.kernels.see_through import cross_layers
 from icheat_usd.kernels.shadow import light_places
 from icheat_usd.lighting.points import light_points
 from icheat_usd.materials import is_glossy
-from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import build_tracer, spawn_points
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.tracing.paths import passing_materials
@@ -67,7 +67,7 @@ def _tracer_of(snapshot: SceneSnapshot, kept: np.ndarray) -> EmbreeTracer:
 class Places:
     """Surface points made ready for `direct_at`."""
 
-    order: I64 | None  #: place i is point ``order[i]``; None: the points' own order
+    row: I32  #: (n,) point of each place
     place: F32  #: (n, 9), see `kernels.shadow.light_places`
     tint: F32  #: (n, 3)
     gloss: F32  #: (n, 12), or (0, 12) where no lobe is wanted
@@ -89,10 +89,11 @@ def prepare_places(
     gloss = np.zeros((0, 12), np.float32)
     if to_eye is not None and is_glossy(points).any():
         gloss = _lobes(points, to_eye)
+    row = np.arange(len(place), dtype=np.int32) if order is None else order.astype(np.int32)
     if order is not None:
         place, tint = place[order], tint[order]
         gloss = gloss[order] if len(gloss) else gloss
-    return Places(order, *(np.ascontiguousarray(table, np.float32) for table in (place, tint, gloss)))
+    return Places(row, *(np.ascontiguousarray(table, np.float32) for table in (place, tint, gloss)))
 
 
 def _lobes(points: SurfacePoints, to_eye: F32) -> F32:
@@ -107,26 +108,23 @@ def _lobes(points: SurfacePoints, to_eye: F32) -> F32:
     return table
 
 
-def direct_at(snapshot: SceneSnapshot, shadows: Shadows, places: Places, seed: int, share_rays: bool, out: F32) -> None:
+def direct_at(
+    snapshot: SceneSnapshot, shadows: Shadows, places: Places, seed: int, share_rays: bool, out: F32, turn: int = 0
+) -> None:
     """Light of a one-light snapshot that places reflect, one shadow ray each, into `out` (n, 3) in the points' order.
 
+    The mean over turns 0, 1, 2, ... converges: every turn looks at other points of the light.
     Kinds with a surface of their own and distant lights only. Surfaces that let light through dim it as for all
     shadow rays.
     """
     table, distant = light_points(snapshot, seed)
-    n = len(places.place)
-    found = out if places.order is None else np.empty((n, 3), np.float32)
-    through = np.empty(n, np.int32)
+    through = np.empty(len(places.place), np.int32)
     function, opaque = shadows.opaque.address_of("rtcOccluded16")
     passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
-    light_places(
-        function, opaque, passing, table, distant, seed, places.place, places.tint, places.gloss, share_rays, found,
-        through,
-    )  # fmt: skip
+    tables = places.place, places.tint, places.gloss
+    light_places(function, opaque, passing, table, distant, seed, turn, *tables, share_rays, places.row, out, through)
     if shadows.passing is not None:
         rows = np.flatnonzero(through)
         origin, end = places.place[rows, :3], table[through[rows] - 1, :3]
         direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
-        found[rows] *= shadows.crossing(snapshot, origin, direction, limit)[:, None]
-    if places.order is not None:
-        out[places.order] = found
+        out[places.row[rows]] *= shadows.crossing(snapshot, origin, direction, limit)[:, None]

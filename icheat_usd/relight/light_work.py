@@ -98,7 +98,7 @@ def build_surroundings(
         patches = prepare_places(snapshot, gather.patch_points, albedo, None)
         count = np.diff(gather.cell_begin)
         chosen = np.random.default_rng(seed).integers(0, count) + gather.cell_begin[:-1]
-        cells = Places(None, patches.place[chosen], patches.tint[chosen], patches.gloss)
+        cells = Places(np.arange(gather.n, dtype=np.int32), patches.place[chosen], patches.tint[chosen], patches.gloss)
         tiles = prepare_places(snapshot, view.points, view.points.albedo, view.to_eye, _tile_order(view))
     return Surroundings(
         snapshot,
@@ -157,10 +157,9 @@ class MovingLight:
             radiance[:] = solve_bounces(around.bounces, (self._cells / np.float32(turn))[None], around.n_bounces)[0]
             self._find_highlights(view_direct)
             return False
-        seed = int(hash_combine(self._seed, turn))
         places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
         found = np.empty((len(places.place), 3), np.float32)
-        direct_at(self._alone, around.shadows, places, seed, False, found)
+        direct_at(self._alone, around.shadows, places, self._seed, False, found, turn)
         into += found if at_view else around.cell_means(found)
         share = np.float32(1.0 / (turn + 1))
         if at_view:

@@ -1,0 +1,159 @@
+"""Lights at interactive rates against the general sampler and known values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
+from icheat_usd.lighting.change import changed_light, one_light
+from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
+from icheat_usd.lighting.quick import build_shadows, direct_at, prepare_places
+from icheat_usd.materials import points_on_surface
+from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import build_tracer, transmittance
+from icheat_usd.tracing.embree import EmbreeTracer
+from tests.scenes import (
+    IDENTITY,
+    Image,
+    Light,
+    Material,
+    Mesh,
+    Texture,
+    TextureUse,
+    make_snapshot,
+    quad,
+    quads,
+    rotation,
+    scaling,
+    sphere,
+    translation,
+)
+
+DOWN = translation(0.2, 1.5, 0.1) @ rotation((1, 0, 0), -70)
+CHECKS = Image(np.array([[[1.0, 0.2, 0.1], [0.3, 1.0, 0.2]], [[0.1, 0.4, 2.0], [1.0, 1.0, 1.0]]], np.float32))
+LIGHTS = {
+    "rect": Light(LightKind.RECT, (3, 2, 1), DOWN[:3], (0.8, 0.5)),
+    "image": Light(LightKind.RECT, (3, 2, 1), DOWN[:3], (0.8, 0.5), CHECKS),
+    "disk": Light(LightKind.DISK, (3, 2, 1), (DOWN @ scaling(1, 2, 1))[:3], (0.3, 0)),
+    "sphere": Light(LightKind.SPHERE, (3, 2, 1), (translation(0.2, 1.0, 0) @ scaling(1, 0.5, 1))[:3], (0.3, 0)),
+    "cylinder": Light(LightKind.CYLINDER, (3, 2, 1), translation(0.2, 1.0, 0)[:3], (0.1, 0.9)),
+    "sun": Light(LightKind.DISTANT, (3, 2, 1), rotation((1, 0, 0), -60)[:3], (0.2, 0)),
+    "beam": Light(LightKind.DISTANT, (3, 2, 1), rotation((1, 0, 0), -60)[:3]),
+    "mirrored": Light(LightKind.RECT, (3, 2, 1), (DOWN @ scaling(-1, 1, 1))[:3], (0.8, 0.5)),
+}
+
+
+def scene(light: Light, floor: Material) -> SceneSnapshot:
+    """A floor under a ball, a leaf with holes and a pane of glass."""
+    ball, normals = sphere(0.25, 12)
+    st = quads([[[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]])[..., :2]
+    holes = Image(np.array([[[1.0], [0.0]], [[0.0], [1.0]]], np.float32).repeat(3, axis=2))
+    leaf = Material(0.5, opacity_threshold=0.5, textures={Texture.OPACITY: TextureUse(holes, channel=0)})
+    glass = Material(0.0, opacity=0.0, ior=1.5, roughness=0.0)
+    return make_snapshot(
+        [
+            Mesh(quad(3.0), floor, path="/floor"),
+            Mesh(ball, Material(0.5), [translation(-0.3, 0.4, 0)], "/ball", normals),
+            Mesh(quad(0.6), leaf, [translation(0.4, 0.5, 0.3)], "/leaf", st=st),
+            Mesh(quad(0.6), glass, [translation(0.4, 0.5, -0.4)], "/glass"),
+        ],
+        lights=[light],
+    )
+
+
+def on_floor(snapshot: SceneSnapshot, n: int) -> SurfacePoints:
+    uv = np.random.default_rng(2).uniform(0, 1, (n, 2))
+    uv = np.where(uv.sum(1, keepdims=True) > 1, 1 - uv, uv) * 0.999
+    triangle = np.arange(n) % 2
+    return points_on_surface(snapshot, np.zeros(n, int), triangle, uv, 0)
+
+
+def tracer_of(snapshot: SceneSnapshot) -> EmbreeTracer:
+    tracer = build_tracer(snapshot)
+    assert isinstance(tracer, EmbreeTracer)
+    return tracer
+
+
+def rounds(snapshot: SceneSnapshot, points: SurfacePoints, eye: F32 | None, n: int) -> np.ndarray:
+    shadows = build_shadows(snapshot, tracer_of(snapshot))
+    places = prepare_places(snapshot, points, points.albedo, eye)
+    total, found = np.zeros((len(points.instance), 3)), np.empty((len(points.instance), 3), np.float32)
+    for turn in range(n):
+        direct_at(snapshot, shadows, places, 7, False, found, turn)
+        total += found
+    return total / n
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_rounds_of_one_ray_come_to_what_the_general_sampler_finds(name: str) -> None:
+    snapshot = scene(LIGHTS[name], Material(0.5))
+    points = on_floor(snapshot, 300)
+    found = rounds(snapshot, points, None, 128)
+    tracer = tracer_of(snapshot)
+    expected = irradiance(snapshot, tracer, build_light_sampler(snapshot), points, 4, 1024)[0] * (0.5 / np.pi)
+    np.testing.assert_allclose(found.mean(0), expected.mean(0), rtol=0.01)
+    assert np.sqrt(((found - expected) ** 2).sum() / (expected**2).sum()) < 0.06
+
+
+def test_glossy_surfaces_reflect_what_the_general_sampler_finds() -> None:
+    snapshot = scene(LIGHTS["rect"], Material((0.4, 0.2, 0.1), roughness=0.4, ior=1.5, metallic=0.3))
+    points = on_floor(snapshot, 300)
+    eye = np.tile(np.array([0.0, 0.6, 0.8], np.float32), (300, 1))
+    found = rounds(snapshot, points, eye, 64)
+    tracer = tracer_of(snapshot)
+    expected = reflected_direct(snapshot, tracer, build_light_sampler(snapshot), points, eye, 4, 512)[0]
+    np.testing.assert_allclose(found.mean(0), expected.mean(0), rtol=0.02)
+    assert np.sqrt(((found - expected) ** 2).sum() / (expected**2).sum()) < 0.06
+
+
+def test_runs_that_share_rays_agree_with_rays_of_their_own() -> None:
+    """Where all of a run is in the light or all in shadow nothing changes; at shadow edges every place has its ray."""
+    snapshot = scene(LIGHTS["beam"], Material(0.5))
+    points = on_floor(snapshot, 6400)
+    order = np.lexsort((points.position[:, 0], np.floor(points.position[:, 2] * 20)))
+    shadows = build_shadows(snapshot, tracer_of(snapshot))
+    own, shared = np.empty((2, 6400, 3), np.float32)
+    for share, out in ((False, own), (True, shared)):
+        direct_at(snapshot, shadows, prepare_places(snapshot, points, points.albedo, None, order), 0, share, out)
+    assert (own[:, 0] == 0).mean() > 0.01
+    assert (np.abs(own - shared) > 1e-6).any(axis=1).mean() < 0.01
+
+
+def test_light_crosses_layers_as_it_does_for_all_shadow_rays() -> None:
+    snapshot = scene(LIGHTS["beam"], Material(0.5))
+    points = on_floor(snapshot, 2000)
+    shadows = build_shadows(snapshot, tracer_of(snapshot))
+    direction = np.array([0.1, 1.0, 0.2], np.float32) + 0.2 * np.random.default_rng(0).normal(size=(2000, 3))
+    origin, direction = points.position + np.float32([0, 1e-4, 0]), direction.astype(np.float32)
+    assert shadows.passing is not None
+    for limit in (np.inf, 0.4):
+        expected = transmittance(snapshot, shadows.passing, origin, direction, limit)[:, 0]
+        found = shadows.crossing(snapshot, origin, direction, limit)
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert len(np.unique(np.round(found, 3))) > 1
+
+
+def test_a_turned_dome_shines_as_the_general_sampler_says() -> None:
+    rows, columns = np.mgrid[0:16, 0:32]
+    image = Image(np.stack([1 + rows, 2 + columns, 4 + 0 * rows], -1).astype(np.float32) / 8)
+    plain = scene(Light(LightKind.DOME, (1, 2, 1), image=image), Material(0.5, roughness=0.5, ior=1.5))
+    points = on_floor(plain, 200)
+    eye = np.tile(np.array([0.0, 0.6, 0.8], np.float32), (200, 1))
+    tracer = tracer_of(plain)
+    even, sampler = white_sky(plain, tracer, points, 1)
+    seen = see_sky(even, sampler, build_shadows(plain, tracer), points, points.albedo / np.pi, eye, 64, 1)
+    bins = BinnedSky(one_light(plain, 0))
+    for degrees in (0, 100):
+        turned = changed_light(plain, one_light(plain, 0), to_world=rotation((0.3, 1, 0), degrees)[:3])
+        found = np.empty((200, 3), np.float32)
+        seen.light(bins.under(turned), found)
+        expected = reflected_direct(turned, tracer, build_light_sampler(turned), points, eye, 3, 512)[0]
+        np.testing.assert_allclose(found.mean(0), expected.mean(0), rtol=0.02)
+        assert np.sqrt(((found - expected) ** 2).sum() / (expected**2).sum()) < 0.1
+
+
+def test_an_even_sky_fills_every_bin_alike() -> None:
+    snapshot = make_snapshot([Mesh(quad())], lights=[Light(LightKind.DOME, (1, 2, 3), IDENTITY)])
+    sky = BinnedSky(snapshot).under(snapshot)
+    np.testing.assert_allclose(sky, np.broadcast_to((1, 2, 3), sky.shape))
