@@ -23,6 +23,8 @@ _OTHER_TURN = np.float32(0.6)
 # The same for the distance to each other's tangent plane, as a share of their distance on the surface and in the image.
 _SAME_PLANE = np.float32(0.15)
 _OTHER_PLANE = np.float32(0.3)
+_FAR_CORNER = np.float32(4.0)  # pixels from which a surface at an angle does not matter
+_OTHER_CORNER = np.float32(0.05)  # least share of a record on the sheet that is nearer to or further from a corner
 _OTHER_INSTANCE = np.float32(1.5)  # factor of the distance to records on other objects: those of one's own come first
 
 
@@ -185,6 +187,40 @@ def _falling(value, full, none):  # type: ignore[no-untyped-def]
     return t * t * (np.float32(3.0) - np.float32(2.0) * t)
 
 
+@parallel_kernel
+def corner_distance(first, position, normal, extent, pixel, out):  # type: ignore[no-untyped-def]
+    """Distance of view samples to the surfaces that rise from theirs nearby, in pixels at their depth; at most 4.
+
+    What a place sees of a surface that it touches depends on the logarithm of this.
+    """
+    height, width = first.shape
+    for v in prange(len(out)):
+        x, y = np.int64(pixel[v] % width), np.int64(pixel[v] // width)
+        least = _FAR_CORNER
+        for wy in range(max(0, y - 2), min(height, y + 3)):
+            for wx in range(max(0, x - 2), min(width, x + 3)):
+                w = first[wy, wx]
+                if w < 0 or w == v:
+                    continue
+                dx = position[w, 0] - position[v, 0]
+                dy = position[w, 1] - position[v, 1]
+                dz = position[w, 2] - position[v, 2]
+                apart = np.float32(np.sqrt(dx * dx + dy * dy + dz * dz))
+                rise = dx * normal[v, 0] + dy * normal[v, 1] + dz * normal[v, 2]
+                facing = -(dx * normal[w, 0] + dy * normal[w, 1] + dz * normal[w, 2])
+                cosine = normal[v, 0] * normal[w, 0] + normal[v, 1] * normal[w, 1] + normal[v, 2] * normal[w, 2]
+                if cosine < _SAME_TURN and rise > np.float32(0.1) * apart and facing > np.float32(0.0):
+                    least = min(least, facing / extent[v])
+        out[v] = max(least, np.float32(0.05))
+
+
+@kernel
+def _same_corner(corners, v, w):  # type: ignore[no-untyped-def]
+    """1 for places as far from the nearest corner, 0 where one is much nearer."""
+    ratio = abs(np.float32(np.log2(corners[v] / corners[w])))
+    return _falling(ratio, np.float32(0.5), np.float32(2.0))
+
+
 @kernel
 def same_sheet(position, normal, extent, v, w, pixels):  # type: ignore[no-untyped-def]
     """How far two places, `pixels` apart in the image, lie on one sheet of surface: 1 for a plane, 0 across an edge.
@@ -238,6 +274,7 @@ def record_weights(  # type: ignore[no-untyped-def]
     normal,
     instance,
     extent,
+    corners,
     nearness,
     level,
     corner,
@@ -303,7 +340,7 @@ def record_weights(  # type: ignore[no-untyped-def]
                 continue
             w = record_view[r]
             pixels = np.float32(max(abs(node[k, 0] - y), abs(node[k, 1] - x)))
-            alike = same_sheet(position, normal, extent, v, w, pixels)
+            alike = same_sheet(position, normal, extent, v, w, pixels) * _same_corner(corners, v, w)
             if alike > np.float32(0.0):
                 inside += share[k] * alike
                 value = share[k] * alike * nearness[w]
@@ -341,7 +378,10 @@ def record_weights(  # type: ignore[no-untyped-def]
                                 alike = max(alike, np.float32(1e-3))
                             if alike <= np.float32(0.0):
                                 continue
-                            closest = min(closest, pixels)
+                            same = _same_corner(corners, v, w)
+                            if same > np.float32(0.5):
+                                closest = min(closest, pixels)
+                            alike *= max(same * same, _OTHER_CORNER)
                             dx = position[w, 0] - position[v, 0]
                             dy = position[w, 1] - position[v, 1]
                             dz = position[w, 2] - position[v, 2]

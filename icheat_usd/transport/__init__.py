@@ -13,7 +13,10 @@ from icheat_usd.transport.build import Lobe, Transport, build_transport
 from icheat_usd.transport.held_back import HeldBack
 from icheat_usd.transport.packed import PackedLobe, PackedRows, PackedTransport, PackingReport
 from icheat_usd.transport.packing import lossless, pack, residual
+from icheat_usd.transport.progressive import build_transports
+from icheat_usd.transport.records import RecordSettings
 from icheat_usd.transport.sparse import SparseRows
+from icheat_usd.transport.training import training_radiance
 
 __all__ = [
     "Bounces",
@@ -24,10 +27,12 @@ __all__ = [
     "PackedRows",
     "PackedTransport",
     "PackingReport",
+    "RecordSettings",
     "SparseRows",
     "Transport",
     "build_bounces",
     "build_transport",
+    "build_transports",
     "light_cells",
     "lossless",
     "pack",
@@ -35,4 +40,5 @@ __all__ = [
     "solve_bounces",
     "sum_groups",
     "sum_lights",
+    "training_radiance",
 ]

@@ -57,7 +57,11 @@ def build_transports(
     """
     builder = RowBuilder(snapshot, tracer, gather, seed)
     lights = np.ascontiguousarray(training.T)
-    tint = np.stack([_scalar(view.points.albedo), _scalar(view.points.specular), _scalar(view.points.specular_edge)])
+    share = _scalar(view.throughput) * np.float32(
+        view.samples_per_pixel
+    )  # of its pixel's light, where several share it
+    colours = view.points.albedo, view.points.specular, view.points.specular_edge
+    tint = np.stack([_scalar(colour) * share for colour in colours])
     parts: list[list[SparseRows]] = [[], [], []]
 
     def rows_of(samples: I64, stream: I64, first_ray: int, n_rays: int, of_rays: int) -> MeasuredRows:

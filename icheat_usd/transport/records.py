@@ -15,6 +15,8 @@ from icheat_usd.scene import F32, F64, I32, I64, Bool, Camera
 from icheat_usd.transport.sparse import SparseRows
 
 _BUCKET = 8  # pixels
+_LEAST_GAIN = 0.005  # of the number of records: blocks to divide for which another round of rays is worth its time
+_FAINT = 0.02  # of the light that arrives: what shows less, as reflections in glass do, gets no records of its own
 _FOR_BLOCKS = 0.9  # of the records: some are left for sheets that were found by no corner
 _MISFIT = 0.5  # of a sample comes from the corners of its block: with less, records beside them must be near
 _PRIOR = 0.02  # squared relative error where a sheet has no record of its own to tell, before any has
@@ -84,6 +86,10 @@ class _Mesh:
             self._nearness = (np.sqrt(x * x + y * y + 1) / depth).astype(np.float32)
         self.first = np.full(shape, -1, np.int64)
         self.first.reshape(-1)[view.pixel[::-1]] = np.arange(view.n)[::-1]
+        self._corners = np.empty(view.n, np.float32)
+        kernels.corner_distance(
+            self.first, view.points.position, view.points.shading_normal, self._extent, view.pixel, self._corners
+        )
         self.level = np.full(shape, coarsest.bit_length() - 1, np.int32)
         self.parent = self.level.copy()  #: before the last division
         self.corner = np.zeros(shape, np.uint8)
@@ -123,6 +129,7 @@ class _Mesh:
             view.points.shading_normal,
             view.points.instance,
             self._extent,
+            self._corners,
             self._nearness,
             self.level,
             self.corner,
@@ -174,7 +181,7 @@ def place_records(
     """
     mesh = _Mesh(view, camera, settings.coarsest)
     most = int(settings.max_share * view.n)
-    shown = tint.max(axis=0) > 0
+    shown = tint.max(axis=0) > _FAINT
     table: Records | None = None
     response = np.empty((2, len(tint), 0, 0), np.float32)
     tests = _Tests()
@@ -197,7 +204,7 @@ def place_records(
         ranked = divisible[np.lexsort((divisible, share[divisible]))]
         ranked = ranked[np.cumsum(share[ranked]) > settings.tolerance**2][::-1]
         ranked = ranked[: max(0, (int(_FOR_BLOCKS * most) - len(mesh.record_view)) // 3)]
-        if not len(ranked):
+        if len(ranked) < _LEAST_GAIN * len(mesh.record_view):
             break
         chosen = np.zeros(mesh.level.size, bool)
         chosen[ranked] = True
