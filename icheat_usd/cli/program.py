@@ -38,6 +38,7 @@ VERBS = (
     "gc",
     "history",
     "cache",
+    "warm",
 )
 
 CLEAN, FINDINGS, FAILURE, INTERRUPTED = 0, 1, 2, 130

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Protocol, TypeVar, cast
 
@@ -25,6 +26,9 @@ from icheat_usd.transport.records import RecordSettings
 from icheat_usd.transport.training import training_radiance
 
 Part = TypeVar("Part")
+
+#: Records that any image may have, however small it is.
+FEWEST_RECORDS = 8_192
 
 #: What takes less time to make than this is not kept on disk: reading it back would take as long.
 WORTH_KEEPING_SECONDS = 1.0
@@ -166,7 +170,7 @@ class ShotParts:
             self.view,
             self.gather,
             self.training,
-            settings=RecordSettings(tolerance=quality.record_error),
+            settings=_record_settings(quality.record_error, self.view.n),
             rays_per_row=quality.record_rays,
             seed=quality.seed,
             progress=self.progress,
@@ -269,3 +273,9 @@ class ShotParts:
             "width": camera.width,
             "height": camera.height,
         }
+
+
+def _record_settings(error: float, n_view: int) -> RecordSettings:
+    """Of a large image few samples are enough; what interpolates in a small one are its very features."""
+    settings = RecordSettings(tolerance=error)
+    return replace(settings, max_share=min(1.0, max(settings.max_share, FEWEST_RECORDS / max(n_view, 1))))
