@@ -525,14 +525,6 @@ def _sum_terms(unedited, versions, pair_of, values, out):  # type: ignore[no-unt
 
 
 @parallel_kernel
-def clamp_samples(samples, light):  # type: ignore[no-untyped-def]
-    """Hold some rows of `light` at 0 or above."""
-    for k in prange(len(samples)):
-        for c in range(3):
-            light[samples[k], c] = max(light[samples[k], c], np.float32(0))
-
-
-@parallel_kernel
 def multiply_edited_rows(begin, cell, weight, factor, emission, b, out):  # type: ignore[no-untyped-def]
     """``out[row] = sum of weight (sum_g factor_g b_g + emission)`` over the entries of each row, (n_rows, 4)."""
     for row in prange(len(out)):
@@ -647,15 +639,24 @@ def add_terms(
 
 
 @parallel_kernel
-def develop_pixels(pixels, sample_begin, still, throughput, direct, indirect, out):  # type: ignore[no-untyped-def]
-    """``out[pixel] = still[pixel] + sum of throughput (direct + indirect)`` over the samples of some pixels."""
+def develop_pixels(pixels, sample_begin, still, throughput, direct, indirect, touched, out):  # type: ignore[no-untyped-def]
+    """``out[pixel] = still[pixel] + sum of throughput (direct + indirect)`` over the samples of some pixels.
+
+    Indirect light of samples that edits have touched is held at 0 or above.
+    """
     for k in prange(len(pixels)):
         pixel = pixels[k]
-        for c in range(3):
-            total = still[pixel, c]
-            for s in range(sample_begin[pixel], sample_begin[pixel + 1]):
-                total += throughput[s, c] * (direct[s, c] + indirect[s, c])
-            out[pixel, c] = total
+        red, green, blue = still[pixel, 0], still[pixel, 1], still[pixel, 2]
+        for s in range(sample_begin[pixel], sample_begin[pixel + 1]):
+            r, g, b = indirect[s, 0], indirect[s, 1], indirect[s, 2]
+            if touched[s]:
+                r, g, b = max(r, np.float32(0)), max(g, np.float32(0)), max(b, np.float32(0))
+            red += throughput[s, 0] * (direct[s, 0] + r)
+            green += throughput[s, 1] * (direct[s, 1] + g)
+            blue += throughput[s, 2] * (direct[s, 2] + b)
+        out[pixel, 0] = red
+        out[pixel, 1] = green
+        out[pixel, 2] = blue
 
 
 @parallel_kernel

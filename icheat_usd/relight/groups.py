@@ -23,6 +23,8 @@ from icheat_usd.scene import F32, I32, I64
 
 #: More terms than this, and the samples of a group are evaluated pair by pair.
 MOST_TERMS = 16
+#: The same where the terms are summed for all samples of a group at once.
+MOST_SHARED_TERMS = 64
 
 
 class Term(NamedTuple):
@@ -50,8 +52,16 @@ class TermTable(NamedTuple):
     factor: I32
 
 
-def group_terms(compiled: CompiledStack, whole: Sequence[int], soft: Sequence[int]) -> GroupTerms:
-    """Terms of samples that some rows touch wholly and some softly."""
+def group_terms(
+    compiled: CompiledStack, whole: Sequence[int], soft: Sequence[int], divided: bool = False
+) -> GroupTerms:
+    """Terms of samples that some rows touch wholly and some softly.
+
+    Parameters
+    ----------
+    divided
+        Rows that no caster has in common go to terms of their own: more terms of fewer versions.
+    """
     way = compiled.way
     touching = [row for row in (*whole, *soft) if way[row] != Way.VIEW]
     aggregates = sorted(row for row in touching if way[row] == Way.AGGREGATE)
@@ -64,15 +74,29 @@ def group_terms(compiled: CompiledStack, whole: Sequence[int], soft: Sequence[in
         return GroupTerms(alone=True)
     members = sorted(varying + [int(compiled.row_table[row, 4]) for row in aggregates], key=_order(compiled))
     light = _terms(compiled, hard, members, -1)
+    if divided and light and not light[0].factors:
+        parts = _components(compiled, light[0].version.whole)
+        light = (*(Term(VersionKey(part), ()) for part in parts), *light[1:])
     seen = []
     for row in aggregates:
         edit = compiled.edit_of[row]
         below = [member for member in members if compiled.edit_of[member] < edit]
         terms = _terms(compiled, tuple(r for r in hard if compiled.edit_of[r] < edit), below, row)
         seen.append((row, terms))
-    if max([len(light), *(len(terms) for _, terms in seen)]) > MOST_TERMS:
+    most = MOST_TERMS if members else MOST_SHARED_TERMS
+    if max([len(light), *(len(terms) for _, terms in seen)]) > most:
         return GroupTerms(alone=True)
     return GroupTerms(light, tuple(seen), view=any(way[row] == Way.VIEW for row in (*whole, *soft)))
+
+
+def _components(compiled: CompiledStack, rows: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """The rows in sets that have no caster in common, each ascending."""
+    parts: list[set[int]] = []
+    for row in rows:
+        near = {other for other in rows if _meets(compiled, (row, other))} | {row}
+        meeting = [part for part in parts if part & near]
+        parts = [part for part in parts if not part & near] + [near.union(*meeting)]
+    return sorted(tuple(sorted(part)) for part in parts)
 
 
 def _order(compiled: CompiledStack):  # type: ignore[no-untyped-def]
@@ -128,8 +152,8 @@ def _terms(compiled: CompiledStack, hard: tuple[int, ...], members: Sequence[int
 class SampleGroups:
     """Which group each view sample belongs to; groups are numbered as they appear."""
 
-    def __init__(self, compiled: CompiledStack, n_view: int) -> None:
-        self._compiled = compiled
+    def __init__(self, compiled: CompiledStack, n_view: int, divided: bool = False) -> None:
+        self._compiled, self.divided = compiled, divided
         self._number: dict[bytes, int] = {}
         self.of_sample: I32 = np.full(n_view, -1, np.int32)  #: -1: no edit touches it
         self.terms: list[GroupTerms] = []
@@ -156,5 +180,5 @@ class SampleGroups:
             bits = np.unpackbits(key.view(np.uint8), bitorder="little")
             whole, soft = (np.flatnonzero(bits[side : side + n_rows]).tolist() for side in (0, 64 * words))
             self._number[name] = len(self.terms)
-            self.terms.append(group_terms(self._compiled, whole, soft))
+            self.terms.append(group_terms(self._compiled, whole, soft, self.divided))
         return self._number[name]

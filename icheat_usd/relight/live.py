@@ -29,6 +29,9 @@ from icheat_usd.scene import F32, I64, Bool, SceneSnapshot
 from icheat_usd.transport import HeldBack, Transport, sum_groups
 from icheat_usd.transport.packed import PackedTransport
 
+#: More versions than this, and edits that have no casters in common are kept apart: a version takes a megabyte.
+MOST_VERSIONS = 192
+
 
 class Lights(Protocol):
     """What is asked of lights; see `relight.lights.LiveLights`."""
@@ -232,7 +235,9 @@ class LiveRelighter:
     def relit(self) -> RelitView:
         """Light of every view sample, in layers."""
         self._update()
-        return RelitView(self._direct.copy(), self._base.copy(), self._edited.copy())
+        # Held at 0 or above once, at the end, as in the film.
+        held = np.where(self._touched[:, None], np.maximum(self._edited, np.float32(0)), self._edited)
+        return RelitView(self._direct.copy(), self._base.copy(), held)
 
     def refine(self) -> bool:
         """At rest: bring lights to their final quality, then take back what packing lost; False when nothing is left.
@@ -266,14 +271,14 @@ class LiveRelighter:
         elif (self._stack.active_rows != self._active_rows).any():
             self._find_touched()
 
-    def _regroup(self) -> None:
-        """Find anew which samples share what."""
+    def _regroup(self, divided: bool = False) -> None:
+        """Find anew which samples share what; `divided` as in `relight.groups.group_terms`."""
         stack = self._stack
         if self._pair_products is None and (stack.compiled.way == Way.PAIRS).any():
             raise EditError("the stack has edits that look at receivers, which needs exact rows; build them again")
         if self._pair_products is not None:
             self._pair_products.forget()
-        self._groups = SampleGroups(stack.compiled, self.view.n)
+        self._groups = SampleGroups(stack.compiled, self.view.n, divided)
         self._versions = Versions(stack.compiled, self._products, self._pair_products, self.gather.area)
         self._terms = TermTables(stack.compiled, self._groups, self._versions)
         self._shared = SharedLight(self._products, self.view.n)
@@ -288,6 +293,9 @@ class LiveRelighter:
         groups, products = self._groups, self._products
         groups.assign(samples, self._stack.receiver_masks)
         self._terms.arrange()
+        if self._versions.n > MOST_VERSIONS and not groups.divided:
+            self._regroup(divided=True)
+            return
         spread = products.interpolation
         needed = np.zeros((self._versions.n, products.n_tiles), np.uint8)
         touched = samples[groups.of_sample[samples] >= 0]
@@ -319,7 +327,6 @@ class LiveRelighter:
         self._active_rows = self._stack.active_rows
         self._touched = self._touched_by(np.flatnonzero(self._active_rows))
         self._mixed_samples = np.flatnonzero(self._mixed)
-        self._shared_samples = np.flatnonzero(self._touched & ~self._mixed)
 
     def _touched_by(self, rows: Iterable[int]) -> Bool:
         found = np.zeros(self.view.n, np.bool_)
@@ -338,7 +345,10 @@ class LiveRelighter:
         """Samples to find the light of anew, and their pixels."""
         samples, pixels = self._samples_of_rows(frozenset(self._changed_rows))
         if self._changed_samples:
-            samples = np.unique(np.concatenate([samples, *self._changed_samples]))
+            flags = np.zeros(self.view.n, np.bool_)
+            for some in (samples, *self._changed_samples):
+                flags[some] = True
+            samples = np.flatnonzero(flags)
             pixels = self._pixels_of(samples)
         return samples, pixels
 
@@ -373,7 +383,14 @@ class LiveRelighter:
         self._shared.edited(self._terms.light, self._versions, self._edited)
         self._edit(samples)
         kernels.develop_pixels(
-            pixels, self._sample_begin, self._still, self._throughput, self._direct, self._edited, self._film
+            pixels,
+            self._sample_begin,
+            self._still,
+            self._throughput,
+            self._direct,
+            self._edited,
+            self._touched,
+            self._film,
         )
 
     def _look_at_lights(self) -> None:
@@ -394,13 +411,12 @@ class LiveRelighter:
         return sum_groups(self.lights.radiance * self.lights.gains[:, None, :], field.light_group, field.n_groups)
 
     def _edit(self, samples: I64) -> None:
-        """Find the light of those of some samples that do not share theirs, and hold all edited light at 0 or above."""
+        """Find the light of those of some samples that do not share theirs."""
         samples = samples[self._mixed[samples]]
         idle = samples[~self._touched[samples]]
         self._own[idle] = self._base[idle]
         self._edit_mixed(samples[self._touched[samples]])
         self._edited[self._mixed_samples] = np.take(self._own, self._mixed_samples, axis=0)
-        kernels.clamp_samples(self._shared_samples, self._edited)
 
     def _edit_mixed(self, samples: I64) -> None:
         if not len(samples):

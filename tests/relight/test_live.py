@@ -174,6 +174,22 @@ def test_wavelets_that_lose_nothing_change_nothing(operation):
     np.testing.assert_array_equal(shown.frame(), fresh(of, EditStack("/stack", edits), np.ones((2, 3))).frame())
 
 
+def test_many_versions_are_divided(monkeypatch):
+    """Edits of different casters on the same receivers, with and without others between."""
+    edits = tuple(
+        edit(f"e{k}", operation, select("/floor", "/back"), select(*casters))
+        for k, (operation, casters) in enumerate(
+            [("scale", ("/red",)), ("hsv", ("/green",)), ("scale", ("/red", "/tall")), ("falloff", ("/ceiling",))]
+        )
+    )
+    whole = fresh(pipeline("full"), EditStack("/stack", edits), np.ones((2, 3)))
+    n = whole._versions.n
+    monkeypatch.setattr("icheat_usd.relight.live.MOST_VERSIONS", 0)
+    divided = fresh(pipeline("full"), EditStack("/stack", edits), np.ones((2, 3)))
+    assert (n, divided._versions.n) == (1, 3)
+    np.testing.assert_allclose(divided.frame(), whole.frame(), rtol=1e-5, atol=1e-6)
+
+
 def test_refining_takes_back_what_packing_loses():
     of = pipeline("full")
     good = packed("full")
