@@ -27,6 +27,7 @@ from icheat_usd.materials import (
     shade_hits,
     take_points,
 )
+from icheat_usd.materials.surface import nonzero_rows
 from icheat_usd.scene import F32, F64, DeltaKind, Hits, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, spawn_points, transmittance
 from icheat_usd.tracing.paths import passing_materials
@@ -154,7 +155,7 @@ def _direct(
     counts = _counts(n_samples, len(lights.kind))
     n_specular = _n_specular(counts)
     out = np.zeros((len(lights.kind), n, 3), np.float32)
-    for light in np.flatnonzero(lights.radiance.any(axis=1)).tolist():
+    for light in np.flatnonzero(nonzero_rows(lights.radiance)).tolist():
         delta = _is_delta(snapshot, light)
         count = 1 if delta else counts[light]
         step = max(1, _RAYS // count)
@@ -167,7 +168,7 @@ def _direct(
             value = rays.radiance
             if to_eye is not None:
                 value = value * _response(chunk, to_eye[part], rays, None if delta else (count, n_specular))
-                lit = np.flatnonzero(value.any(axis=1))
+                lit = np.flatnonzero(nonzero_rows(value))
                 rays, value = rays.take(lit), value[lit]
             value = value * _visibility(snapshot, tracer, chunk, rays)
             _add(value, rays.point, out[light, part])
@@ -246,10 +247,10 @@ def _add_specular_rays(
             if lights.kind[light] == LightKind.DOME:
                 if unblocked is None:
                     unblocked = transmittance(snapshot, tracer, rays.origin, rays.direction, np.inf)
-                met = np.flatnonzero(radiance.any(axis=1) & unblocked.any(axis=1))
+                met = np.flatnonzero(nonzero_rows(radiance) & nonzero_rows(unblocked))
                 visible = unblocked[met]
             else:
-                met = np.flatnonzero(radiance.any(axis=1))
+                met = np.flatnonzero(nonzero_rows(radiance))
                 visible = transmittance(
                     snapshot, tracer, rays.origin[met], rays.direction[met], distance[met] * _STOP_SHORT
                 )
@@ -283,7 +284,7 @@ def _specular_rays(
     starts, eye = take_points(points, chosen[owner]), to_eye[chosen[owner]]
     direction, base, edge = sample_specular(starts, eye, numbers)
     weight = (starts.specular * base[:, None] + starts.specular_edge * edge[:, None]) * np.float32(1.0 / count)
-    alive = np.flatnonzero(weight.any(axis=1))
+    alive = np.flatnonzero(nonzero_rows(weight))
     starts, direction = take_points(starts, alive), np.ascontiguousarray(direction[alive])
     pdf = evaluate_specular(starts, eye[alive], direction).pdf.astype(np.float64)
     return _SpecularRays(owner[alive], starts, spawn_points(snapshot, starts, direction), direction, pdf, weight[alive])
@@ -407,7 +408,7 @@ def _shadow_rays(
             pdf,
             radiance,
         )
-        rows = np.flatnonzero(radiance.any(axis=1))
+        rows = np.flatnonzero(nonzero_rows(radiance))
         return _ShadowRays(rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows], None)
 
     emissive = np.full(n, -1, np.int64)
@@ -415,12 +416,12 @@ def _shadow_rays(
     fill_mesh(
         snapshot.lights, sampler.tables, light, *place, direction, distance, pdf, radiance, emissive, barycentric
     )  # fmt: skip
-    rows = np.flatnonzero(radiance.any(axis=1))
+    rows = np.flatnonzero(nonzero_rows(radiance))
     triangles = emissive[rows]
     owner, triangle = snapshot.lights.triangle_instance[triangles], snapshot.lights.triangle[triangles]
     end = points_on_surface(snapshot, owner, triangle, barycentric[rows], 0)  # both sides emit alike
     rays = _ShadowRays(rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows] * end.emission, end)
-    dark = ~rays.radiance.any(axis=1)
+    dark = ~nonzero_rows(rays.radiance)
     return rays.take(np.flatnonzero(~dark)) if dark.any() else rays
 
 
