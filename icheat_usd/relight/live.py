@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import copy
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -99,9 +100,11 @@ class LiveRelighter:
                 raise SampleSetMismatch(
                     f"the transport has {len(lobe.tint)} view samples, the view {self.view.n}; build it for this view"
                 )
+        exact = transport.source if isinstance(transport, PackedTransport) else transport
+        if exact is None:
+            self._refuse_pairs()
         self.transport = transport
         self._products = Products(transport, self.gather.tree)
-        exact = transport.source if isinstance(transport, PackedTransport) else transport
         self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
         self._exact_products: Products | None = None
         self._is_exact = False
@@ -119,7 +122,7 @@ class LiveRelighter:
         EditError
             An edit cannot be placed on the scene; what was shown before stays.
         """
-        self._changed(self._stack.set_stack(stack, self._light_paths()))
+        self._command(lambda: self._stack.set_stack(stack, self._light_paths()))
 
     def set_amount(self, edit_path: str, amount: float) -> None:
         """Change how much of one edit is laid over the others; 0 leaves it out.
@@ -129,7 +132,7 @@ class LiveRelighter:
         EditError
             There is no such edit, or the amount is not finite.
         """
-        self._changed(self._stack.set_amount(edit_path, amount))
+        self._command(lambda: self._stack.set_amount(edit_path, amount))
 
     def dab(self, edit_path: str, side: str, mask: SurfaceMask, key: int = 0) -> None:
         """Paint: show another mask of one edit, on the same surfaces; only what its texels touch is found anew.
@@ -157,11 +160,12 @@ class LiveRelighter:
         assert payload is not None
         payload = replace(payload, receiver_mask=mask) if side == "receivers" else replace(payload, caster_mask=mask)
         keys = (*edit.keys[:key], replace(edit.keys[key], payload=payload, digest=""), *edit.keys[key + 1 :])
-        self._changed(self._stack.set_edit(replace(edit, keys=keys)))
+        self._command(lambda: self._stack.set_edit(replace(edit, keys=keys)))
 
     def mute(self, edit_path: str, muted: bool = True) -> None:
         """Leave one edit out, or show it again."""
-        self._changed(self._stack.set_edit(replace(self._stack.edit(edit_path), enabled=not muted)))
+        edit = replace(self._stack.edit(edit_path), enabled=not muted)
+        self._command(lambda: self._stack.set_edit(edit))
 
     def reorder(self, edit_paths: Sequence[str]) -> None:
         """Apply the edits in another order, weakest first.
@@ -258,9 +262,17 @@ class LiveRelighter:
 
     # Structure --------------------------------------------------------------------------------------------------------
 
-    def _changed(self, change: Change | None) -> None:
+    def _command(self, act: Callable[[], Change | None]) -> None:
+        """Change the stack and what follows from it; after an error all is as it was."""
+        before = copy.copy(self._stack)
+        change = act()
         if change is None:
-            self._regroup()
+            try:
+                self._regroup()
+            except EditError:
+                self._stack = before
+                self._regroup()
+                raise
             return
         self._versions.stack_changed(self._stack.compiled, change.rows)
         self._changed_rows.update(change.rows)
@@ -274,9 +286,9 @@ class LiveRelighter:
     def _regroup(self, divided: bool = False) -> None:
         """Find anew which samples share what; `divided` as in `relight.groups.group_terms`."""
         stack = self._stack
-        if self._pair_products is None and (stack.compiled.way == Way.PAIRS).any():
-            raise EditError("the stack has edits that look at receivers, which needs exact rows; build them again")
-        if self._pair_products is not None:
+        if self._pair_products is None:
+            self._refuse_pairs()
+        else:
             self._pair_products.forget()
         self._groups = SampleGroups(stack.compiled, self.view.n, divided)
         self._versions = Versions(stack.compiled, self._products, self._pair_products, self.gather.area)
@@ -287,6 +299,13 @@ class LiveRelighter:
         self._samples_of: dict[frozenset[int], tuple[I64, I64]] = {}
         self._light_stale = True
         self._place(np.flatnonzero((stack.receiver_masks != 0).any(axis=0)))
+
+    def _refuse_pairs(self) -> None:
+        """Raise an error if the stack needs exact rows."""
+        compiled = self._stack.compiled
+        for row in np.flatnonzero((compiled.way == Way.PAIRS) | (compiled.way == Way.ALONE)):
+            path = compiled.field.edits[compiled.edit_of[row]].edit.path
+            raise EditError(f"{path}: the edit looks at receivers, which needs exact rows of the transport; build them")
 
     def _place(self, samples: I64) -> None:
         """Find the groups of some samples, and make the versions and products that these need."""
@@ -396,7 +415,7 @@ class LiveRelighter:
     def _look_at_lights(self) -> None:
         revision = getattr(self.lights, "revision", None)
         if self._light_paths() != self._stack.light_paths:
-            self._changed(self._stack.set_stack(self._stack.stack, self._light_paths()))
+            self._command(lambda: self._stack.set_stack(self._stack.stack, self._light_paths()))
         # Lights that do not tell are taken to have changed.
         self._light_stale |= revision is None or revision != self._lights_seen
         self._lights_seen = revision

@@ -241,3 +241,21 @@ def test_mistakes_are_told():
         with pytest.raises(EditError, match=message):
             command()
     assert shown.stack is stack
+
+
+def test_a_stack_that_cannot_be_shown_changes_nothing():
+    of = pipeline("full")
+    good = EditStack("/stack", (edit("a", "scale"),))
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, packed("full"), StillLights(of))
+    shown.set_stack(good)
+    before = shown.frame()
+    with pytest.raises(EditError, match="HeldBack"):
+        shown.set_stack(EditStack("/stack", (edit("a", "scale"), edit("b", "unshadow"))))
+    with pytest.raises(EditError, match="has no parameter"):
+        shown.set_stack(EditStack("/stack", (replace(good.edits[0], parameters={"size": 1.0}),)))
+    assert shown.stack is good
+    np.testing.assert_array_equal(shown.frame(), before)
+    shown.set_transport(replace(packed("full"), source=None))
+    with pytest.raises(EditError, match="/c: the edit looks at receivers, which needs exact rows"):
+        shown.set_stack(EditStack("/stack", (edit("c", "falloff"),)))
+    np.testing.assert_array_equal(shown.frame(), before)
