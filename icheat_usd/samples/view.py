@@ -11,11 +11,19 @@ from icheat_usd.kernels.camera import camera_rays
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import environment_radiance
 from icheat_usd.materials import concatenate_points, dielectric_split, empty_points, shade_hits, take_points
-from icheat_usd.scene import F32, F64, I32, I64, DeltaKind, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, DeltaKind, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
 _RAYS_AT_ONCE = 1 << 19
 _MAX_DEPTH = 16  # deltas along a path that never needs to choose
+
+
+class SkyPaths(NamedTuple):
+    """Camera paths that leave the scene."""
+
+    pixel: I32  #: (n,)
+    throughput: F32  #: (n, 3)
+    direction: F32  #: (n, 3) unit
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,7 @@ class ViewSamples:
     to_eye: F32  #: (n, 3) unit, back along the last segment of the path
     depth: F32  #: (n,) length of the path from the eye, metres
     background: F32  #: (width * height, 3) radiance of the paths that left the scene, already weighted
+    sky: SkyPaths | None = None  #: these paths, for another sky
 
     @property
     def n(self) -> int:
@@ -101,7 +110,7 @@ def view_samples(
         raise ValueError(f"a pixel needs at least one sample, not {samples_per_pixel}")
     camera = snapshot.camera
     n_pixels = camera.width * camera.height
-    background = np.zeros((n_pixels, 3), np.float64)
+    escaped: list[SkyPaths] = []
     found: list[_Found] = []
     at_once = max(1, _RAYS_AT_ONCE // samples_per_pixel)
     begin, end = (0, n_pixels) if pixels is None else pixels
@@ -109,7 +118,7 @@ def view_samples(
         n = (min(first + at_once, end) - first) * samples_per_pixel
         paths, limit = _camera_paths(snapshot, first, n, samples_per_pixel, seed)
         found += _follow(
-            snapshot, tracer, paths, limit, int(hash_combine(seed & 0xFFFFFFFF, first)), max_splits, background
+            snapshot, tracer, paths, limit, int(hash_combine(seed & 0xFFFFFFFF, first)), max_splits, escaped
         )
     pixel = np.concatenate([np.empty(0, np.int32), *(part.pixel for part in found)])
     order = np.argsort(pixel, kind="stable")
@@ -119,6 +128,8 @@ def view_samples(
         parts = [np.empty((0, *width), np.float32), *(getattr(part, name) for part in found)]
         return np.ascontiguousarray(np.concatenate(parts)[order])
 
+    nothing = SkyPaths(np.empty(0, np.int32), np.empty((0, 3), np.float32), np.empty((0, 3), np.float32))
+    sky = SkyPaths(*(np.concatenate(columns) for columns in zip(nothing, *escaped, strict=True)))
     return ViewSamples(
         camera.width,
         camera.height,
@@ -128,7 +139,8 @@ def view_samples(
         take_points(points, order),
         ordered("to_eye", (3,)),
         ordered("depth", ()),
-        background.astype(np.float32),
+        sky_behind(snapshot, sky, n_pixels),
+        sky,
     )
 
 
@@ -168,9 +180,9 @@ def _follow(
     limit: F32 | None,
     seed: int,
     max_splits: int,
-    background: F64,
+    sky: list[SkyPaths],
 ) -> list[_Found]:
-    """Follow paths to their ends; what leaves the scene goes into `background`."""
+    """Follow paths to their ends; what leaves the scene goes into `sky`."""
     found: list[_Found] = []
     for _ in range(_MAX_DEPTH):
         if not len(paths.pixel):
@@ -178,7 +190,7 @@ def _follow(
         hits = tracer.intersect(paths.origin, paths.direction, limit)
         limit = None
         points = shade_hits(snapshot, hits, paths.direction)
-        _escape(snapshot, paths, np.flatnonzero(points.instance < 0), background)
+        _escape(paths, np.flatnonzero(points.instance < 0), sky)
         scatters = (points.instance >= 0) & (points.delta == DeltaKind.NONE)
         solid = np.flatnonzero(scatters & (points.opacity >= 1))
         found.append(_end(paths, points, hits.distance, solid, None))
@@ -193,7 +205,7 @@ def _follow(
         stays = (points.delta == DeltaKind.NONE) & (points.opacity > 0)
         divides = reflects.astype(np.int32) + refracts + stays > 1
         chosen = divides & (paths.splits >= max_splits)
-        found += _follow_by_chance(snapshot, tracer, paths.take(np.flatnonzero(chosen)), seed, background)
+        found += _follow_by_chance(snapshot, tracer, paths.take(np.flatnonzero(chosen)), seed, sky)
         followed = ~chosen
         found.append(_end(paths, points, length, np.flatnonzero(stays & followed), points.opacity))
         travelled = paths.travelled + length
@@ -213,23 +225,31 @@ def _follow(
 
 
 def _follow_by_chance(
-    snapshot: SceneSnapshot, tracer: Tracer, paths: _Paths, seed: int, background: F64
+    snapshot: SceneSnapshot, tracer: Tracer, paths: _Paths, seed: int, sky: list[SkyPaths]
 ) -> list[_Found]:
     if not len(paths.pixel):
         return []
     ends = first_surfaces(snapshot, tracer, paths.origin, paths.direction, seed)
     paths = paths._replace(direction=ends.direction, throughput=paths.throughput * ends.throughput)
     alive = paths.throughput.max(axis=1) > 0
-    _escape(snapshot, paths, np.flatnonzero(alive & (ends.points.instance < 0)), background)
+    _escape(paths, np.flatnonzero(alive & (ends.points.instance < 0)), sky)
     return [_end(paths, ends.points, ends.distance, np.flatnonzero(alive & (ends.points.instance >= 0)), None)]
 
 
-def _escape(snapshot: SceneSnapshot, paths: _Paths, rows: I64, background: F64) -> None:
-    if len(rows) and np.any(snapshot.lights.kind == LightKind.DOME):
-        sky = environment_radiance(snapshot, np.ascontiguousarray(paths.direction[rows]))
-        seen = paths.throughput[rows].astype(np.float64) * sky
+def _escape(paths: _Paths, rows: I64, sky: list[SkyPaths]) -> None:
+    if len(rows):
+        sky.append(SkyPaths(paths.pixel[rows], paths.throughput[rows], paths.direction[rows]))
+
+
+def sky_behind(snapshot: SceneSnapshot, paths: SkyPaths, n_pixels: int) -> F32:
+    """Radiance of the domes along camera paths that leave the scene, (n_pixels, 3), weighted."""
+    background = np.zeros((n_pixels, 3), np.float64)
+    if len(paths.pixel) and np.any(snapshot.lights.kind == LightKind.DOME):
+        radiance = environment_radiance(snapshot, np.ascontiguousarray(paths.direction))
+        seen = paths.throughput.astype(np.float64) * radiance
         for channel in range(3):
-            background[:, channel] += np.bincount(paths.pixel[rows], seen[:, channel], len(background))
+            background[:, channel] = np.bincount(paths.pixel, seen[:, channel], n_pixels)
+    return background.astype(np.float32)
 
 
 def _end(paths: _Paths, points: SurfacePoints, length: F32, rows: I64, share: F32 | None) -> _Found:

@@ -11,9 +11,11 @@ from icheat_usd.errors import EditError
 from icheat_usd.relight import RelitView
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.relight.live import LiveRelighter
+from icheat_usd.samples import ViewSamples
 from icheat_usd.scene import F32, F64, LightKind
 from icheat_usd.session.light_changes import light_of_stage
 from icheat_usd.session.live_state import UNCHANGED, EditChange, LightChange, LiveState
+from icheat_usd.session.seen_light import SeenLight
 from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.transport import HeldBack, Transport
 from icheat_usd.transport.packed import PackedTransport
@@ -30,7 +32,6 @@ class Evaluator:
     def __init__(self, parts: ShotParts, transport: Transport | PackedTransport) -> None:
         quality = parts.quality
         self._snapshot = parts.snapshot
-        self.view = parts.view
         self.lights = LiveLights(
             parts.snapshot,
             parts.tracer,
@@ -49,6 +50,7 @@ class Evaluator:
         self.relighter = LiveRelighter(
             parts.snapshot, parts.view, parts.gather, transport, self.lights, held_back=held_back
         )
+        self._seen = SeenLight(parts.snapshot, parts.view)
         self._shown = UNCHANGED
         self._stack: EditStack | None = None
         self._own_rows = {path: row for row, path in reversed(list(enumerate(parts.snapshot.light_paths)))}
@@ -66,12 +68,21 @@ class Evaluator:
             return
         if state.lights is not self._shown.lights:
             self._show_lights(self._shown, state)
+            self._seen.update(self.lights.snapshot())
         self.relighter.set_stack(self._laid_over(stack, state))
         self._shown, self._stack = state, stack
 
     def frame(self, out: F32 | None = None) -> F32:
         """(height, width, 3) float32, scene-linear beauty."""
-        return self.relighter.frame(out)
+        image = self.relighter.frame(out)
+        if self._seen.difference is not None:
+            image += self._seen.difference
+        return image
+
+    @property
+    def view(self) -> ViewSamples:
+        """The view samples, with sky and glowing surfaces as they are now."""
+        return self._seen.view
 
     def relit(self) -> RelitView:
         return self.relighter.relit()

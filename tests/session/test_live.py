@@ -255,3 +255,34 @@ def test_what_cannot_be_made_is_said_to_who_waits(tmp_path: Path) -> None:
     path.write_text('#usda 1.0\ndef Camera "Camera" {}\n')
     with open_live(path) as live, pytest.raises(IcheatError, match="no surface at this frame"):
         live.frame()
+
+
+def test_the_sky_and_what_glows_are_seen_as_they_are_lit(tmp_path: Path) -> None:
+    path = tmp_path / "sky.usda"
+    path.write_text(
+        "#usda 1.0\n(\n    metersPerUnit = 1\n)\n"
+        'def Sphere "Ball"\n{\n    double radius = 0.5\n}\n'
+        'def Cube "Floor"\n{\n    double3 xformOp:translate = (0, -1.6, 0)\n'
+        '    uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
+        'def DomeLight "Sky"\n{\n    float inputs:intensity = 2\n}\n'
+        'def Camera "Camera"\n{\n    double3 xformOp:translate = (0, 0, 5)\n'
+        '    uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
+    )
+    image = np.ones((4, 8, 3), np.float32)
+    image[:, :4] = 0
+    with LiveSession.open(path, width=16, height=12, quality=QUALITY) as live:
+        plain = live.frame(level="rest")
+        assert plain[0, 0, 0] == pytest.approx(2)
+        live.set_light("Sky", gain=0.25)
+        np.testing.assert_allclose(live.frame(level="rest"), 0.25 * plain, rtol=1e-3, atol=1e-5)
+        live.set_light("Sky", gain=1, texture=image)
+        halves = live.frame()
+        live.set_light("Sky", turn=((0, 1, 0), 180))
+        turned = live.frame(level="rest")
+        # What was bright is dark, and the other way round.
+        assert abs(halves[0, 0, 0] - 1) > 0.2
+        np.testing.assert_allclose(turned[0] + halves[0], 2, rtol=1e-3)
+        np.testing.assert_allclose(live.film().layer("beauty"), turned, rtol=1e-5, atol=1e-5)
+        while live.undo():
+            pass
+        np.testing.assert_array_equal(live.frame(level="rest"), plain)
