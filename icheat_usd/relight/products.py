@@ -100,17 +100,18 @@ class Products:
             kernels.spread_cells(versions, tables.cell_begin, tables.cells, deltas, self._versions)
             return
         large = np.diff(tables.cell_begin)[versions] > _MANY_CELLS
-        kernels.haar_of_cells(
-            versions[~large],
-            tables.cell_begin,
-            deltas,
-            tables.node_begin,
-            tables.nodes,
-            tables.child,
-            self._share,
-            self._root,
-            self._versions,
-        )
+        if not large.all():
+            kernels.haar_of_cells(
+                versions[~large],
+                tables.cell_begin,
+                deltas,
+                tables.node_begin,
+                tables.nodes,
+                tables.child,
+                self._share,
+                self._root,
+                self._versions,
+            )
         for version in versions[large]:
             some = slice(tables.cell_begin[version], tables.cell_begin[version + 1])
             values = np.zeros((1, self._n_leaves, 3), np.float32)
