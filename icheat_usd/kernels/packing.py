@@ -1,15 +1,70 @@
 """Packing of sparse rows into tiles of shared Haar coefficients, and the plain product with them.
 
-A tile holds `lanes` consecutive rows. Every parallel iteration owns one tile.
+A tile holds 64 consecutive rows. Every parallel iteration owns one tile.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.packed import LANES
+from icheat_usd.kernels.simd import (
+    address_of,
+    larger,
+    load,
+    load_spread,
+    multiply_add,
+    peak,
+    plus,
+    product,
+    rounded,
+    spread,
+    store,
+    store_int8,
+    total,
+    zeros,
+)
 from icheat_usd.kernels.wavelets import child_weight
+
+_ROW = 4 * LANES  # bytes of a coefficient of all rows
+_VECTOR = 64  # bytes of 16 rows of these
+_AT_ONCE = 64  # coefficients that stay in the first-level cache while all lights pass
+
+
+class HaarTables(NamedTuple):
+    """What the transform of sparse rows needs of a tree."""
+
+    lo: NDArray[np.int32]
+    hi: NDArray[np.int32]
+    left: NDArray[np.int32]
+    right: NDArray[np.int32]
+    of_root: float  #: factor of the sum of all entries in coefficient 0
+    of_left: NDArray[np.float32]  #: factors of the sums over a node's children in its coefficient
+    of_right: NDArray[np.float32]
+    depth: int
+
+
+class SparseTiles(NamedTuple):
+    """Rows in tiles, with what their errors count, and what training lights make of them."""
+
+    indptr: NDArray[np.int64]
+    indices: NDArray[np.int32]
+    weights: NDArray[np.float32]
+    row_weight: NDArray[np.float32]  #: (n_rows,)
+    response: NDArray[np.float32]  #: (n_rows, n) exact
+
+
+class Light(NamedTuple):
+    """Training lights in the Haar basis."""
+
+    coefficients: NDArray[np.float32]  #: (m, n)
+    energy: NDArray[np.float32]  #: (m,) expected square of a coefficient
+    alone: NDArray[np.float32]  #: (m,) share of it that goes together with no other coefficient
 
 
 @parallel_kernel
@@ -89,20 +144,22 @@ def _by_column(indptr, indices, weights, first, last, n_columns):  # type: ignor
 
 
 @kernel
-def _walk_tile(  # type: ignore[no-untyped-def]
-    lo, hi, left, right, of_root, of_left, of_right, depth, begin, lane, entry, square, place, value, score
-):
-    """Haar coefficients of all rows of a tile at once.
+def _transform_tile(tables, begin, lane, entry, square, energy, least, stack, index, value):  # type: ignore[no-untyped-def]
+    """Haar coefficients of all rows of a tile at once, those whose expected squared response is at least `least`.
 
-    Coefficient k goes to ``value[place[k]]`` (lanes,) unless ``place[k]`` is
-    negative; `score` gets its squares summed with the weights `square` (lanes,),
-    and is -1 where no row has any. Walking pre-order backwards meets children before their parent.
+    The response of coefficient k is the sum over rows of ``square * t_k^2 *
+    energy_k``. The root is always kept. Indices and values are filled from the end, ascending;
+    returns their number, which may be more than there is room for.
+    `stack` (depth + 6, 64) is scratch. Walking pre-order backwards meets children before their parent.
     """
-    lanes = len(square)
-    score[:] = -1.0
-    stack, leaves = np.zeros((depth + 2, lanes), np.float32), np.empty((2, lanes), np.float32)
-    none, change, term = np.zeros(lanes, np.float32), np.empty(lanes, np.float32), np.empty(lanes, np.float32)
-    top = 0
+    left, right, lo, hi = tables.left, tables.right, tables.lo, tables.hi
+    room = len(index)
+    scratch = address_of(stack)  # rows of a leaf on either side, one of zeros, one for what has no room; then sums
+    leaf, none, spare, bottom = (scratch, scratch + _ROW), scratch + 2 * _ROW, scratch + 3 * _ROW, scratch + 4 * _ROW
+    squares, values = address_of(square), address_of(value)
+    for offset in range(0, _ROW, _VECTOR):
+        store(none + offset, zeros())
+    top, count = 0, 0
     for step in range(len(left)):
         node = len(left) - 1 - step
         if begin[lo[node]] == begin[hi[node]]:
@@ -111,28 +168,34 @@ def _walk_tile(  # type: ignore[no-untyped-def]
         sum_left, sum_right = none, none
         i, j = left[node], right[node]
         if i < 0:
-            sum_left = _scatter(begin[-1 - i], begin[-i], lane, entry, leaves[0])
+            sum_left = leaf[0]
+            _scatter(begin[-1 - i], begin[-i], lane, entry, stack[0])
         elif begin[lo[i]] < begin[hi[i]]:
             top -= 1
-            sum_left = stack[top]
+            sum_left = bottom + _ROW * top
         if j < 0:
-            sum_right = _scatter(begin[-1 - j], begin[-j], lane, entry, leaves[1])
+            sum_right = leaf[1]
+            _scatter(begin[-1 - j], begin[-j], lane, entry, stack[1])
         elif begin[lo[j]] < begin[hi[j]]:
             top -= 1
-            sum_right = stack[top]
-        _difference(sum_left, sum_right, of_left[node], of_right[node], square, change, term)
-        score[1 + node] = _sum_of(term)
-        if place[1 + node] >= 0:
-            value[place[1 + node], :] = change
-        _add_into(stack[top], sum_left, sum_right)
+            sum_right = bottom + _ROW * top
+        place = values + _ROW * (room - 1 - count) if count < room else spare
+        of_left, of_right = tables.of_left[node], tables.of_right[node]
+        score = _difference(sum_left, sum_right, of_left, of_right, squares, place, bottom + _ROW * top)
+        if score * energy[1 + node] >= least:
+            if count < room:
+                index[room - 1 - count] = 1 + node
+            count += 1
         top += 1
-    if len(left) == 0:
-        _scatter(begin[0], begin[1], lane, entry, stack[0])
     if begin[0] < begin[-1]:
-        _difference(stack[0], none, of_root, np.float32(0), square, change, term)
-        score[0] = _sum_of(term)
-        if place[0] >= 0:
-            value[place[0], :] = change
+        if len(left) == 0:
+            _scatter(begin[0], begin[1], lane, entry, stack[4])
+        place = values + _ROW * (room - 1 - count) if count < room else spare
+        _difference(bottom, none, np.float32(tables.of_root), np.float32(0), squares, place, none)
+        if count < room:
+            index[room - 1 - count] = 0
+        count += 1
+    return count
 
 
 @kernel
@@ -141,118 +204,19 @@ def _scatter(first, last, lane, entry, out):  # type: ignore[no-untyped-def]
     out[:] = 0
     for e in range(first, last):
         out[lane[e]] += entry[e]
-    return out
 
 
 @kernel
-def _difference(a, b, of_a, of_b, square, change, term):  # type: ignore[no-untyped-def]
-    for r in range(len(change)):
-        change[r] = of_a * a[r] - of_b * b[r]
-        term[r] = square[r] * change[r] * change[r]
-
-
-@kernel
-def _add_into(out, a, b):  # type: ignore[no-untyped-def]
-    for r in range(len(out)):
-        out[r] = a[r] + b[r]
-
-
-@kernel
-def _sum_of(term):  # type: ignore[no-untyped-def]
-    """Sum in halves, which vectors can do; `term`, of a power of two, is overwritten."""
-    half = len(term) // 2
-    while half > 0:
-        for r in range(half):
-            term[r] += term[half + r]
-        half //= 2
-    return term[0]
-
-
-@parallel_kernel
-def choose_coefficients(  # type: ignore[no-untyped-def]
-    lo,
-    hi,
-    left,
-    right,
-    of_root,
-    of_left,
-    of_right,
-    depth,
-    indptr,
-    indices,
-    weights,
-    tile,
-    lanes,
-    row_weight,
-    energy,
-    least,
-    kept,
-):
-    """Mark in `kept` (n, m) the coefficients of each tile whose expected squared response is at least `least`.
-
-    The response of coefficient k is the sum over rows of ``(row_weight * t_k)^2
-    * energy_k``. The root is always kept.
-    """
-    for i in prange(len(tile)):
-        first = tile[i] * lanes
-        last = min(first + lanes, len(indptr) - 1)
-        begin, lane, entry = _by_column(indptr, indices, weights, first, last, len(energy))
-        square = np.zeros(lanes, np.float32)
-        for row in range(first, last):
-            square[row - first] = row_weight[row] * row_weight[row]
-        score = np.empty(len(energy), np.float32)
-        place = np.full(len(energy), -1, np.int32)
-        value = np.empty((0, lanes), np.float32)
-        _walk_tile(
-            lo,
-            hi,
-            left,
-            right,
-            of_root,
-            of_left,
-            of_right,
-            depth,
-            begin,
-            lane,
-            entry,
-            square,
-            place,
-            value,
-            score,
-        )
-        for k in range(len(energy)):
-            kept[i, k] = 1 if score[k] >= 0 and (k == 0 or score[k] * energy[k] >= least) else 0
-
-
-@parallel_kernel
-def fill_tiles(  # type: ignore[no-untyped-def]
-    lo, hi, left, right, of_root, of_left, of_right, depth, indptr, indices, weights, tile, lanes, begin, index, value
-):
-    """Coefficients ``index[begin[i]:begin[i + 1]]`` of each tile into the same rows of `value` (n, lanes)."""
-    for i in prange(len(tile)):
-        first = tile[i] * lanes
-        last = min(first + lanes, len(indptr) - 1)
-        column_begin, lane, entry = _by_column(indptr, indices, weights, first, last, len(left) + 1)
-        place = np.full(len(left) + 1, -1, np.int32)
-        for e in range(begin[i], begin[i + 1]):
-            place[index[e]] = e - begin[i]
-        _walk_tile(
-            lo,
-            hi,
-            left,
-            right,
-            of_root,
-            of_left,
-            of_right,
-            depth,
-            column_begin,
-            lane,
-            entry,
-            np.zeros(lanes, np.float32),
-            place,
-            value[begin[i] : begin[i + 1]],
-            np.empty(len(left) + 1, np.float32),
-        )
+def _difference(a, b, of_a, of_b, square, difference, both):  # type: ignore[no-untyped-def]
+    """``of_a a - of_b b`` and ``a + b`` of rows at addresses; the sum of the first's squares times `square`."""
+    factor_a, factor_b, score = spread(of_a), spread(-of_b), zeros()
+    for offset in range(0, _ROW, _VECTOR):
+        x, y = load(a + offset), load(b + offset)
+        change = multiply_add(factor_a, x, product(factor_b, y))
+        store(difference + offset, change)
+        store(both + offset, plus(x, y))
+        score = multiply_add(product(load(square + offset), change), change, score)
+    return total(score)
 
 
 @kernel
@@ -281,87 +245,204 @@ def _invert(matrix):  # type: ignore[no-untyped-def]
     return inverse
 
 
-@parallel_kernel
-def refit_tiles(begin, index, value, tile, lanes, light, energy, response):  # type: ignore[no-untyped-def]
+@kernel
+def _take_lost(first, last, value, light, lost):  # type: ignore[no-untyped-def]
+    """Subtract from `lost` (n, 64) what coefficients ``first:last`` make of each light (n_kept, n)."""
+    for a in range(light.shape[1]):
+        sums = address_of(lost) + _ROW * a
+        s0, s1, s2, s3 = load(sums), load(sums + 64), load(sums + 128), load(sums + 192)
+        place = address_of(value) + _ROW * first
+        for e in range(first, last):
+            factor = spread(-light[e, a])
+            s0 = multiply_add(factor, load(place), s0)
+            s1 = multiply_add(factor, load(place + 64), s1)
+            s2 = multiply_add(factor, load(place + 128), s2)
+            s3 = multiply_add(factor, load(place + 192), s3)
+            place += _ROW
+        store(sums, s0)
+        store(sums + 64, s1)
+        store(sums + 128, s2)
+        store(sums + 192, s3)
+
+
+@kernel
+def _add_change(light, share, value):  # type: ignore[no-untyped-def]
+    """Add to `value` (n_kept, 64) the sum over lights of ``light (n_kept, n) share (n, 64)``."""
+    place, shares, factors = address_of(value), address_of(share), address_of(light)
+    for _ in range(len(light)):
+        s0, s1, s2, s3 = load(place), load(place + 64), load(place + 128), load(place + 192)
+        other = shares
+        for _ in range(light.shape[1]):
+            factor = load_spread(factors)
+            s0 = multiply_add(factor, load(other), s0)
+            s1 = multiply_add(factor, load(other + 64), s1)
+            s2 = multiply_add(factor, load(other + 128), s2)
+            s3 = multiply_add(factor, load(other + 192), s3)
+            factors += 4
+            other += _ROW
+        store(place, s0)
+        store(place + 64, s1)
+        store(place + 128, s2)
+        store(place + 192, s3)
+        place += _ROW
+
+
+@kernel
+def _refit_tile(light, index, value, lost):  # type: ignore[no-untyped-def]
     """Let the kept coefficients stand in for the others, as far as lights excite both together.
 
     With coefficients of light of covariance ``L L^T / n + D``, L the training
-    lights `light` (m, n) and D = `energy`, the response that is lost is
+    lights (m, n) and D their `alone`, the response that is lost is
     expected to be ``E[lost | kept] = e (G + n I)^-1 L_kept^T D^-1 b_kept``, where
     e is what is lost of the training lights and G = L_kept^T D^-1 L_kept: a ridge
     regression. The root stays as it is, so that uniform light is right.
-    `response` (n_rows, n) is exact.
+    `lost` (n, 64) is the exact response, and is overwritten.
     """
-    n = light.shape[1]
-    for i in prange(len(tile)):
-        first = tile[i] * lanes
-        n_rows = min(lanes, len(response) - first)
-        lost = np.zeros((n, lanes), np.float64)
-        for r in range(n_rows):
-            for a in range(n):
-                lost[a, r] = response[first + r, a]
-        gram = np.zeros((n, n), np.float64)
-        for e in range(begin[i], begin[i + 1]):
-            k = index[e]
-            inverse = 1.0 / energy[k] if k > 0 and energy[k] > 0.0 else 0.0
-            for a in range(n):
-                factor = np.float64(light[k, a])
-                for r in range(lanes):
-                    lost[a, r] -= factor * value[e, r]
-                factor *= inverse
-                for b in range(n):
-                    gram[a, b] += factor * light[k, b]
+    n = light.coefficients.shape[1]
+    kept, gram = np.empty((len(index), n), np.float32), np.zeros((n, n), np.float64)
+    for e in range(len(index)):
         for a in range(n):
-            gram[a, a] += n
-        solver = _invert(gram)
-        share = np.zeros((n, lanes), np.float64)
+            kept[e, a] = light.coefficients[index[e], a]
+    for first in range(0, len(index), _AT_ONCE):
+        _take_lost(first, min(first + _AT_ONCE, len(index)), value, kept, lost)
+    for e in range(len(index)):
+        alone = light.alone[index[e]]
+        inverse = np.float32(1.0) / alone if index[e] > 0 and alone > np.float32(0) else np.float32(0)
         for a in range(n):
+            factor = np.float64(kept[e, a] * inverse)
             for b in range(n):
-                for r in range(lanes):
-                    share[a, r] += solver[a, b] * lost[b, r]
-        change = np.empty(lanes, np.float64)
-        for e in range(begin[i], begin[i + 1]):
-            k = index[e]
-            if k > 0 and energy[k] > 0.0:
-                change[:] = 0.0
-                for a in range(n):
-                    factor = light[k, a] / energy[k]
-                    for r in range(lanes):
-                        change[r] += factor * share[a, r]
-                for r in range(n_rows):
-                    value[e, r] += change[r]
+                gram[a, b] += factor * kept[e, b]
+        for a in range(n):
+            kept[e, a] *= inverse
+    for a in range(n):
+        gram[a, a] += n
+    solver = _invert(gram)
+    share = np.zeros((n, LANES), np.float32)
+    for r in range(LANES):
+        for a in range(n):
+            sum_of_lights = 0.0
+            for b in range(n):
+                sum_of_lights += solver[a, b] * lost[b, r]
+            share[a, r] = sum_of_lights
+    _add_change(kept, share, value)
+
+
+@kernel
+def _quantise(value, square, quanta, rest):  # type: ignore[no-untyped-def]
+    """Round a coefficient (64,) to quanta at an address, and leave the rest at another.
+
+    Returns the value of a quantum, and the rest's sum of squares times `square`.
+    """
+    largest, left = zeros(), zeros()
+    for offset in range(0, _ROW, _VECTOR):
+        largest = larger(largest, load(value + offset))
+    scale = peak(largest) / np.float32(127)
+    if scale < np.float32(1e-36):  # whose inverse might be infinite
+        return np.float32(0), np.float32(0)
+    inverse, one = spread(np.float32(1) / scale), spread(-scale)
+    for offset in range(0, _ROW, _VECTOR):
+        x = load(value + offset)
+        whole = rounded(product(x, inverse))
+        store_int8(quanta + offset // 4, whole)
+        difference = multiply_add(one, whole, x)
+        store(rest + offset, difference)
+        left = multiply_add(product(load(square + offset), difference), difference, left)
+    return scale, total(left)
+
+
+@kernel
+def _round_tile(index, value, square, energy, least, rest, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+    """Round coefficients to quanta, and what that leaves to quanta of its own where it counts; their number.
+
+    What is left counts as a coefficient does in `_transform_tile`, and at the root always.
+    """
+    count = 0
+    values, squares, left, quanta = address_of(value), address_of(square), address_of(rest), address_of(out_value)
+    for e in range(len(index)):
+        scale, lost = _quantise(values + _ROW * e, squares, quanta + LANES * count, left)
+        if scale == np.float32(0):
+            continue
+        out_index[count], out_scale[count] = index[e], scale
+        count += 1
+        if index[e] == 0 or lost * energy[index[e]] >= least:
+            scale, _ = _quantise(left, squares, quanta + LANES * count, left)
+            if scale > np.float32(0):
+                out_index[count], out_scale[count] = index[e], scale
+                count += 1
+    return count
+
+
+@kernel
+def _squares(tiles, first):  # type: ignore[no-untyped-def]
+    """Squared weights of the rows of a tile, 0 where there are none."""
+    square = np.zeros(LANES, np.float32)
+    for row in range(first, min(first + LANES, len(tiles.row_weight))):
+        square[row - first] = tiles.row_weight[row] * tiles.row_weight[row]
+    return square
+
+
+@kernel
+def _transform(tables, tiles, tile, energy, least, index, value):  # type: ignore[no-untyped-def]
+    """`_transform_tile` of a tile by its number."""
+    first = tile * LANES
+    last = min(first + LANES, len(tiles.indptr) - 1)
+    columns = _by_column(tiles.indptr, tiles.indices, tiles.weights, first, last, len(energy))
+    stack = np.empty((tables.depth + 6, LANES), np.float32)
+    return _transform_tile(tables, *columns, _squares(tiles, first), energy, least, stack, index, value)
 
 
 @parallel_kernel
-def quantise(begin, index, value, tile, row_weight, energy, least, scale, quanta, rest_scale, rest):  # type: ignore[no-untyped-def]
-    """Round each coefficient (n, lanes) to quanta, and what that leaves to quanta of its own where it counts.
+def transform_tiles(tables, tiles, tile, energy, least, index, value, count):  # type: ignore[no-untyped-def]
+    """Coefficients of some tiles that are worth at least `least`, at the end of `index` (n, room) and `value`.
 
-    What is left counts as a coefficient does in `choose_coefficients`, and at
-    the root always. Elsewhere `rest_scale` is 0.
+    `count` (n,) is their number, which may be more than there is room for.
     """
-    lanes = value.shape[1]
     for i in prange(len(tile)):
-        first = tile[i] * lanes
-        for e in range(begin[i], begin[i + 1]):
-            largest = np.float32(0)
-            for r in range(lanes):
-                largest = max(largest, abs(value[e, r]))
-            scale[e] = largest / np.float32(127)
-            rest_scale[e] = 0
-            for r in range(lanes):
-                quanta[e, r] = 0
-            if scale[e] == 0:
-                continue
-            over = np.float32(0)
-            left = 0.0
-            for r in range(lanes):
-                quanta[e, r] = np.int8(np.rint(value[e, r] / scale[e]))
-                difference = value[e, r] - scale[e] * np.float32(quanta[e, r])
-                over = max(over, abs(difference))
-                if first + r < len(row_weight):
-                    left += (row_weight[first + r] * difference) ** 2
-            if over / np.float32(127) > 0 and (index[e] == 0 or left * energy[index[e]] >= least):
-                rest_scale[e] = over / np.float32(127)
-                for r in range(lanes):
-                    difference = value[e, r] - scale[e] * np.float32(quanta[e, r])
-                    rest[e, r] = np.int8(np.rint(difference / rest_scale[e]))
+        count[i] = _transform(tables, tiles, tile[i], energy, least, index[i], value[i])
+
+
+@kernel
+def _pack_tile(tables, tiles, tile, light, least, index, value, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+    """Coefficients of a tile, refitted and rounded: how many there are, and how many are kept before rounding."""
+    n_kept = _transform(tables, tiles, tile, light.energy, least, index, value)
+    if n_kept > len(index):
+        return 0, n_kept
+    first = tile * LANES
+    some = slice(len(index) - n_kept, len(index))
+    lost = np.zeros((light.coefficients.shape[1], LANES), np.float32)
+    for row in range(first, min(first + LANES, len(tiles.response))):
+        for a in range(len(lost)):
+            lost[a, row - first] = tiles.response[row, a]
+    _refit_tile(light, index[some], value[some], lost)
+    square, rest = _squares(tiles, first), np.zeros(LANES, np.float32)
+    count = _round_tile(index[some], value[some], square, light.energy, least, rest, out_index, out_scale, out_value)
+    return count, n_kept
+
+
+@parallel_kernel
+def pack_tiles(  # type: ignore[no-untyped-def]
+    tables, tiles, tile, light, least, index, value, out_index, out_scale, out_value, count, n_kept
+):
+    """Pack some tiles.
+
+    Parameters
+    ----------
+    tile : (n,) int64
+    least : float32
+        Expected squared response from which on a coefficient is kept.
+    index : (n, room) int32
+    value : (n, room, 64) float32
+        Scratch.
+    out_index : (n, 2 room) int32
+    out_scale : (n, 2 room) float32
+    out_value : (n, 2 room, 64) int8
+        Coefficients as in `PackedRows`.
+    count : (n,) int64
+        How many there are.
+    n_kept : (n,) int64
+        Of how many. Where that is more than `room`, there is no result.
+    """
+    for i in prange(len(tile)):
+        count[i], n_kept[i] = _pack_tile(
+            tables, tiles, tile[i], light, least, index[i], value[i], out_index[i], out_scale[i], out_value[i]
+        )

@@ -143,6 +143,56 @@ def multiply_add(builder: Any, values: Any) -> Any:
     return _call(builder, "llvm.fmuladd.v16f32", _F16X, *values)
 
 
+@_operation(floats, floats, floats)
+def plus(builder: Any, values: Any) -> Any:
+    """``a + b``."""
+    return builder.fadd(*values)
+
+
+@_operation(floats, floats, floats)
+def larger(builder: Any, values: Any) -> Any:
+    """The larger of `a` and ``|b|``, place by place; `a` where `b` is not a number."""
+    return _larger_size(builder, values[0], values[1], _I16X)
+
+
+@_operation(types.float32, floats)
+def total(builder: Any, values: Any) -> Any:
+    """Sum of all 16, in halves."""
+    return _halved(builder, values[0], builder.fadd)
+
+
+@_operation(types.float32, floats)
+def peak(builder: Any, values: Any) -> Any:
+    """The largest of all 16, of which none is below 0."""
+    return _halved(builder, values[0], lambda a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
+
+
+def _halved(builder: Any, value: Any, combine: Any) -> Any:
+    """Combine the halves of a vector until one number is left."""
+    size = 16
+    while size > 1:
+        size //= 2
+        value = combine(
+            _picked(builder, value, value, list(range(size))),
+            _picked(builder, value, value, list(range(size, 2 * size))),
+        )
+    return builder.extract_element(value, ir.Constant(_I32, 0))
+
+
+@_operation(floats, floats)
+def rounded(builder: Any, values: Any) -> Any:
+    """To the nearest whole number, the even one of two."""
+    return _call(builder, "llvm.rint.v16f32", _F16X, values[0])
+
+
+@_operation(types.void, types.int64, floats)
+def store_int8(builder: Any, values: Any) -> None:
+    """16 whole numbers within -128..127 as int8 to an address."""
+    kind = ir.VectorType(_I8, 16)
+    small = builder.trunc(builder.fptosi(values[1], _I16X), kind)
+    builder.store(small, _at(builder, values[0], kind), align=1)
+
+
 @_operation(types.void, types.int64, floats)
 def store(builder: Any, values: Any) -> None:
     """16 float32 to an address."""
@@ -236,20 +286,24 @@ def difference(builder: Any, values: Any) -> Any:
 @_operation(color, color, color)
 def plus_size(builder: Any, values: Any) -> Any:
     """``a + |b|``."""
-    return builder.fadd(values[0], _size(builder, values[1]))
+    return builder.fadd(values[0], _size(builder, values[1], ir.VectorType(_I32, 4)))
 
 
 @_operation(color, color, color)
 def larger_size(builder: Any, values: Any) -> Any:
     """The larger of `a` and ``|b|``, `a` where `b` is not a number."""
-    size = _size(builder, values[1])
-    return builder.select(builder.fcmp_ordered(">", size, values[0]), size, values[0])
+    return _larger_size(builder, values[0], values[1], ir.VectorType(_I32, 4))
 
 
-def _size(builder: Any, value: Any) -> Any:
-    kind = ir.VectorType(_I32, 4)
-    bits = builder.and_(builder.bitcast(value, kind), ir.Constant(kind, [0x7FFFFFFF] * 4))
-    return builder.bitcast(bits, _F4X)
+def _larger_size(builder: Any, a: Any, b: Any, bits: Any) -> Any:
+    size = _size(builder, b, bits)
+    return builder.select(builder.fcmp_ordered(">", size, a), size, a)
+
+
+def _size(builder: Any, value: Any, bits: Any) -> Any:
+    """Size of each float of a vector; `bits` is the type of whole numbers as wide as it."""
+    size = builder.and_(builder.bitcast(value, bits), ir.Constant(bits, [0x7FFFFFFF] * bits.count))
+    return builder.bitcast(size, value.type)
 
 
 @_operation(types.void, types.int64, color)

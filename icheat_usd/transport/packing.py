@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,11 @@ from icheat_usd.transport.packed import LANES, PackedLobe, PackedRows, PackedTra
 from icheat_usd.transport.sparse import SparseRows
 
 _TILES_AT_ONCE = 16
-_TILES_OF_A_TRIAL = 32  # that the amount to keep is found on; spread over all
+_TILES_OF_A_TRIAL = 16  # that the amount to keep is found on; spread over all
 _TRIALS = 6
-_CLOSE_ENOUGH = 1.05  # ratio of errors at which the search for the amount ends
+_FIRST_ROOM = 16384  # coefficients of a tile
+_FIRST_LEAST = 2e-4  # worth of a coefficient to begin the search with, of a tile's tolerated squared error
+_CLOSE_ENOUGH = 1.08  # ratio of errors at which the search for the amount ends
 _PRIOR = 0.2  # share of the energy that is taken from a coefficient's surroundings: the training lights are few
 _PRIOR_LEVELS = 4  # of ancestors that these surroundings reach up
 _ANYWHERE = 0.1  # share of those that is the same everywhere: no place stays dark for ever
@@ -35,20 +37,51 @@ class _Weighted(NamedTuple):
     response: F32  #: (n_rows, n_lights) exact
 
 
-class _Lights(NamedTuple):
-    """Training lights in the Haar basis."""
+class _Tile(NamedTuple):
+    """A packed tile."""
 
-    coefficients: F32  #: (m, n_lights), each light's response in the whole view is 1
-    energy: F64  #: (m,) expected square of each coefficient
-
-
-class _Chunk(NamedTuple):
-    """Some packed tiles."""
-
-    counts: I64  #: (n_tiles,) coefficients
-    coefficient: I32
+    index: I32
     scale: F32
     value: NDArray[np.int8]
+
+
+class _Packer:
+    """Packs tiles of rows on one tree; keeps what that needs from one time to the next."""
+
+    def __init__(self, tree: ClusterTree) -> None:
+        self.tree = tree
+        self._tables = _haar_tables(tree)
+        self._make_room(min(tree.n_leaves, _FIRST_ROOM))
+
+    def _make_room(self, room: int) -> None:
+        n = _TILES_AT_ONCE
+        self._index, self._value = np.empty((n, room), np.int32), np.empty((n, room, LANES), np.float32)
+        self._packed = _Tile(
+            np.empty((n, 2 * room), np.int32),
+            np.empty((n, 2 * room), np.float32),
+            np.empty((n, 2 * room, LANES), np.int8),
+        )
+
+    def pack(self, part: _Weighted, light: kernels.Light, tiles: I64, least: float) -> list[_Tile]:
+        """Pack a few tiles with the coefficients that are worth at least `least`."""
+        count, n_kept = np.zeros((2, len(tiles)), np.int64)
+        while True:
+            kernels.pack_tiles(
+                self._tables,
+                _sparse_tiles(part),
+                tiles,
+                light,
+                np.float32(least),
+                self._index,
+                self._value,
+                *self._packed,
+                count,
+                n_kept,
+            )
+            if n_kept.max() <= self._index.shape[1]:
+                break
+            self._make_room(min(self.tree.n_leaves, 5 * int(n_kept.max()) // 4))
+        return [_Tile(*(column[i, :n].copy() for column in self._packed)) for i, n in enumerate(count)]
 
 
 def pack(
@@ -108,30 +141,42 @@ def pack_on_tree(
         raise ValueError("the rows belong to another gather set than the one given")
     progress("choose coefficients", 0.0)
     weighted = [_weigh(lobe, transport.interpolation, training) for lobe in transport.lobes]
-    weighted, lights = _normalise(tree, training, weighted)
-    least, light_error = _find_least(tree, weighted, lights, tolerance, max_bytes, progress)
+    weighted, light = _normalise(tree, training, weighted)
+    packer = _Packer(tree)
+    least, light_error = _find_least(packer, weighted, light, tolerance, max_bytes, progress)
     lobes = []
     n_tiles = sum(_n_tiles(part.rows) for part in weighted if part.rows.n_entries)
     done = 0
     for lobe, part in zip(transport.lobes, weighted, strict=True):
-        chunks = []
+        tiles: list[_Tile] = []
         for first in range(0, _n_tiles(part.rows), _TILES_AT_ONCE) if part.rows.n_entries else ():
-            tiles = np.arange(first, min(first + _TILES_AT_ONCE, _n_tiles(part.rows)))
-            chunks.append(_pack_tiles(tree, part, lights, tiles, least))
-            done += len(tiles)
+            some = np.arange(first, min(first + _TILES_AT_ONCE, _n_tiles(part.rows)))
+            tiles += packer.pack(part, light, some, least)
+            done += len(some)
             progress("pack the transport", done / n_tiles)
-        lobes.append(PackedLobe(lobe.name, _join(tree, part.rows.n_rows, chunks), lobe.tint))
+        lobes.append(PackedLobe(lobe.name, _join(tree, part.rows.n_rows, tiles), lobe.tint))
     report = PackingReport(light_error)
     return PackedTransport(tuple(lobes), transport.row_view, transport.interpolation, transport, report)
 
 
 def lossless(rows: SparseRows, tree: ClusterTree) -> PackedRows:
     """All coefficients in float32: exact to rounding, and of a size for small scenes only."""
-    tiles = np.arange(_n_tiles(rows))
-    ones = np.ones(tree.n_leaves)
-    counts, index = _choose(tree, rows, np.ones(rows.n_rows), ones, tiles, 0.0)
-    value = _fill(tree, rows, tiles, counts, index)
-    return PackedRows(tree, rows.n_rows, _begin(counts), index, np.ones(len(index), np.float32), value)
+    n_tiles, room = _n_tiles(rows), tree.n_leaves
+    weighted = _Weighted(rows, np.ones(rows.n_rows), np.zeros((rows.n_rows, 0), np.float32))
+    index, value = np.empty((n_tiles, room), np.int32), np.empty((n_tiles, room, LANES), np.float32)
+    counts = np.empty(n_tiles, np.int64)
+    kernels.transform_tiles(
+        _haar_tables(tree),
+        _sparse_tiles(weighted),
+        np.arange(n_tiles),
+        np.ones(tree.n_leaves, np.float32),
+        np.float32(0),
+        index,
+        value,
+        counts,
+    )
+    used = np.arange(room) >= room - counts[:, None]
+    return PackedRows(tree, rows.n_rows, _begin(counts), index[used], np.ones(counts.sum(), np.float32), value[used])
 
 
 def residual(packed: PackedTransport, radiance: F32) -> list[F32]:
@@ -168,7 +213,7 @@ def _weigh(lobe: Lobe, interpolation: SparseRows | None, training: F32) -> _Weig
     return _Weighted(lobe.rows, np.sqrt(square[: lobe.rows.n_rows]), response)
 
 
-def _normalise(tree: ClusterTree, training: F32, weighted: list[_Weighted]) -> tuple[list[_Weighted], _Lights]:
+def _normalise(tree: ClusterTree, training: F32, weighted: list[_Weighted]) -> tuple[list[_Weighted], kernels.Light]:
     """Scale the lights to a response of 1 in the view."""
     squared = sum((_squared_response(part) for part in weighted), np.zeros(len(training)))
     of_white = sum(float(np.sum((part.row_weight * part.rows.row_sums()) ** 2)) for part in weighted)
@@ -177,16 +222,15 @@ def _normalise(tree: ClusterTree, training: F32, weighted: list[_Weighted]) -> t
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     coefficients = haar_forward(tree, np.ascontiguousarray((training * scale[:, None]).T)).astype(np.float32)
     parts = [part._replace(response=np.ascontiguousarray(part.response * scale, np.float32)) for part in weighted]
-    return parts, _Lights(coefficients, _energy(tree, coefficients))
+    return parts, _light(tree, coefficients)
 
 
-def _energy(tree: ClusterTree, coefficients: F32) -> F64:
-    if not coefficients.shape[1]:
-        return np.ones(tree.n_leaves)
+def _light(tree: ClusterTree, coefficients: F32) -> kernels.Light:
     seen = np.mean(coefficients.astype(np.float64) ** 2, axis=1)
     around = np.empty_like(seen)
     kernels.smooth_energy(tree.left, tree.right, tree.node_weight, _PRIOR_LEVELS, _ANYWHERE, seen, around)
-    return (1 - _PRIOR) * seen + _PRIOR * around
+    energy = (1 - _PRIOR) * seen + _PRIOR * around
+    return kernels.Light(coefficients, energy.astype(np.float32), (_UNSEEN * energy).astype(np.float32))
 
 
 def _squared_response(part: _Weighted) -> F64:
@@ -194,9 +238,9 @@ def _squared_response(part: _Weighted) -> F64:
 
 
 def _find_least(
-    tree: ClusterTree,
+    packer: _Packer,
     weighted: list[_Weighted],
-    lights: _Lights,
+    light: kernels.Light,
     tolerance: float,
     max_bytes: int | None,
     progress: Progress,
@@ -207,7 +251,7 @@ def _find_least(
     measured with the other, and the other way round.
     """
     parts = [(part, _some_tiles(_n_tiles(part.rows))) for part in weighted if part.rows.n_entries]
-    n_lights = lights.coefficients.shape[1]
+    n_lights = light.coefficients.shape[1]
     total = sum(
         (_squared_response(_part_of_tiles(part, tiles)) * (_n_tiles(part.rows) / len(tiles)) for part, tiles in parts),
         np.zeros(n_lights),
@@ -215,15 +259,16 @@ def _find_least(
     lit = total > 0
     if not lit.any():
         return float(np.finfo(np.float32).tiny), np.zeros(0)
-    halves = [_half(tree, lights, np.arange(side, n_lights, 2)) for side in (0, 1)]
-    least = tolerance**2 * 2e-3 / sum(_n_tiles(part.rows) for part, _ in parts)
+    halves = [np.arange(side, n_lights, 2) for side in (0, 1)]
+    of_half = [_light(packer.tree, np.ascontiguousarray(light.coefficients[:, half])) for half in halves]
+    least = tolerance**2 * _FIRST_LEAST / sum(_n_tiles(part.rows) for part, _ in parts)
     tried: list[tuple[float, float, F64]] = []  # logarithms of a worth and of error / tolerance, and errors
     for trial in range(_TRIALS):
         squared, size = np.zeros(n_lights), 0.0
         for part, tiles in parts:
             share = _n_tiles(part.rows) / len(tiles)
-            for (half, trained), (_, others) in zip(halves, reversed(halves), strict=True):
-                error, n_kept = _try(tree, part, lights, half, trained, others, tiles, least)
+            for known, trained, others in zip(of_half, halves, reversed(halves), strict=True):
+                error, n_kept = _try(packer, part, light, known, trained, others, tiles, least)
                 squared[others] += share * error
                 size += 0.5 * share * n_kept * (LANES + 8)
         errors = np.sqrt(squared[lit] / total[lit])
@@ -240,16 +285,11 @@ def _find_least(
     return float(np.exp(worth)), errors
 
 
-def _half(tree: ClusterTree, lights: _Lights, which: I64) -> tuple[_Lights, I64]:
-    coefficients = np.ascontiguousarray(lights.coefficients[:, which])
-    return _Lights(coefficients, _energy(tree, coefficients)), which
-
-
 def _try(
-    tree: ClusterTree,
+    packer: _Packer,
     part: _Weighted,
-    lights: _Lights,
-    half: _Lights,
+    light: kernels.Light,
+    known: kernels.Light,
     trained: I64,
     others: I64,
     tiles: I64,
@@ -258,14 +298,14 @@ def _try(
     """Squared errors of the lights `others` in some tiles packed by the lights `trained`, and entries kept."""
     of_half = part._replace(response=np.ascontiguousarray(part.response[:, trained]))
     squared, n_kept = np.zeros(len(others)), 0
-    unknown = np.ascontiguousarray(lights.coefficients[:, others])
+    unknown = np.ascontiguousarray(light.coefficients[:, others])
     for first in range(0, len(tiles), _TILES_AT_ONCE):
         some = tiles[first : first + _TILES_AT_ONCE]
-        chunk = _pack_tiles(tree, of_half, half, some, least)
+        packed = _join(packer.tree, len(some) * LANES, packer.pack(of_half, known, some, least))
         exact = _part_of_tiles(part, some)
-        product = _join(tree, len(some) * LANES, [chunk]).multiply(unknown)[: len(exact.row_weight)]
+        product = packed.multiply(unknown)[: len(exact.row_weight)]
         squared += np.square(exact.row_weight) @ np.square((product - exact.response[:, others]).astype(np.float64))
-        n_kept += len(chunk.coefficient)
+        n_kept += len(packed.index)
     return squared, n_kept
 
 
@@ -299,59 +339,23 @@ def _begin(counts: I64) -> I64:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
-def _haar_arguments(tree: ClusterTree) -> tuple[Any, ...]:
+def _haar_tables(tree: ClusterTree) -> kernels.HaarTables:
     of_left, of_right = (np.empty(len(tree.left), np.float32) for _ in range(2))
     kernels.haar_factors(tree.left, tree.right, tree.weight, tree.node_weight, of_left, of_right)
-    of_root = np.float32(1 / np.sqrt(tree.node_weight[0] if len(tree.left) else tree.weight[0]))
-    return tree.lo, tree.hi, tree.left, tree.right, of_root, of_left, of_right, tree.depth
+    of_root = 1 / float(np.sqrt(tree.node_weight[0] if len(tree.left) else tree.weight[0]))
+    return kernels.HaarTables(tree.lo, tree.hi, tree.left, tree.right, of_root, of_left, of_right, int(tree.depth))
 
 
-def _choose(
-    tree: ClusterTree, rows: SparseRows, row_weight: F64, energy: F64, tiles: I64, least: float
-) -> tuple[I64, I32]:
-    """Number and indices of the coefficients of each tile that are worth at least `least`."""
-    kept = np.empty((len(tiles), tree.n_leaves), np.uint8)
-    entries = rows.indptr, rows.indices, rows.weights
-    arguments = *_haar_arguments(tree), *entries, tiles, LANES, row_weight, energy, least, kept
-    kernels.choose_coefficients(*arguments)
-    return kept.sum(axis=1, dtype=np.int64), np.nonzero(kept)[1].astype(np.int32)
+def _sparse_tiles(part: _Weighted) -> kernels.SparseTiles:
+    rows = part.rows
+    weight = part.row_weight.astype(np.float32)
+    return kernels.SparseTiles(rows.indptr, rows.indices, rows.weights, weight, part.response)
 
 
-def _fill(tree: ClusterTree, rows: SparseRows, tiles: I64, counts: I64, index: I32) -> F32:
-    value = np.empty((len(index), LANES), np.float32)
-    entries = rows.indptr, rows.indices, rows.weights
-    arguments = *_haar_arguments(tree), *entries, tiles, LANES, _begin(counts), index, value
-    kernels.fill_tiles(*arguments)
-    return value
-
-
-def _pack_tiles(tree: ClusterTree, part: _Weighted, lights: _Lights, tiles: I64, least: float) -> _Chunk:
-    counts, index = _choose(tree, part.rows, part.row_weight, lights.energy, tiles, least)
-    begin = _begin(counts)
-    value = _fill(tree, part.rows, tiles, counts, index)
-    response = part.response
-    kernels.refit_tiles(begin, index, value, tiles, LANES, lights.coefficients, _UNSEEN * lights.energy, response)
-    scale, rest_scale = np.empty(len(index), np.float32), np.empty(len(index), np.float32)
-    quanta, rest = np.empty(value.shape, np.int8), np.empty(value.shape, np.int8)
-    kernels.quantise(begin, index, value, tiles, part.row_weight, lights.energy, least, scale, quanta, rest_scale, rest)
-    twice = np.flatnonzero(rest_scale)
-    order = np.argsort(np.concatenate([np.arange(len(index)), twice]), kind="stable")
-    tile = np.repeat(np.arange(len(tiles)), counts)
-    return _Chunk(
-        counts + np.bincount(tile[twice], minlength=len(tiles)),
-        np.concatenate([index, index[twice]])[order],
-        np.concatenate([scale, rest_scale[twice]])[order],
-        np.concatenate([quanta, rest[twice]])[order],
-    )
-
-
-def _join(tree: ClusterTree, n_rows: int, chunks: list[_Chunk]) -> PackedRows:
-    counts = np.concatenate([chunk.counts for chunk in chunks]) if chunks else np.zeros(-(-n_rows // LANES), np.int64)
-    return PackedRows(
-        tree,
-        n_rows,
-        _begin(counts),
-        np.concatenate([np.empty(0, np.int32), *(chunk.coefficient for chunk in chunks)]),
-        np.concatenate([np.empty(0, np.float32), *(chunk.scale for chunk in chunks)]),
-        np.concatenate([np.empty((0, LANES), np.int8), *(chunk.value for chunk in chunks)]),
-    )
+def _join(tree: ClusterTree, n_rows: int, tiles: list[_Tile]) -> PackedRows:
+    if not tiles:
+        tiles = [_Tile(np.empty(0, np.int32), np.empty(0, np.float32), np.empty((0, LANES), np.int8))] * (
+            -(-n_rows // LANES)
+        )
+    begin = _begin(np.array([len(tile.index) for tile in tiles], np.int64))
+    return PackedRows(tree, n_rows, begin, *(np.concatenate(column) for column in zip(*tiles, strict=True)))
