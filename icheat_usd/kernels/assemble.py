@@ -202,11 +202,43 @@ def assemble_view(row, weight, more_view, more_row, more_weight, products, tint,
 
 
 @kernel
+def _replace_run(first, n, own_view, own, touched, sent):  # type: ignore[no-untyped-def]
+    """Put the indirect light that some of `n` view samples have of their own, and hold that of edited ones at 0."""
+    for k in range(np.searchsorted(own_view, first), np.searchsorted(own_view, first + n)):
+        v = np.int64(own_view[k])
+        for c in range(3):
+            sent[v - first, c] = own[v, c]
+    if len(touched) == 0:
+        return
+    for i in range(n):
+        if touched[first + i]:
+            for c in range(3):
+                sent[i, c] = max(sent[i, c], np.float32(0.0))
+
+
+@kernel
 def _sent_run(  # type: ignore[no-untyped-def]
-    first, n, row, weight, more_view, more_row, more_weight, products, tint, direct, gains, throughput, out
+    first,
+    n,
+    row,
+    weight,
+    more_view,
+    more_row,
+    more_weight,
+    products,
+    tint,
+    own_view,
+    own,
+    touched,
+    direct,
+    gains,
+    throughput,
+    sent,
 ):
-    """Direct and indirect light of `n` view samples times their throughput to an address."""
+    """Direct and indirect light of `n` view samples times their throughput to `sent` (n, 3)."""
+    out = address_of(sent)
     _indirect_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, out)
+    _replace_run(first, n, own_view, own, touched, sent)
     gain = np.empty(48, np.float32)
     for light in range(len(direct)):
         for i in range(48):
@@ -216,6 +248,34 @@ def _sent_run(  # type: ignore[no-untyped-def]
     if len(throughput) > 0:
         _multiply_run(n, out, address_of(throughput) + 12 * first, out)
     gain[0] = np.float32(0.0)  # keeps it, see `_indirect_run`
+
+
+@kernel
+def _sum_run(first, n, values, gains, out):  # type: ignore[no-untyped-def]
+    """`n` rows of a weighted sum."""
+    gain = np.empty(48, np.float32)
+    place = address_of(out) + 12 * first
+    out[first : first + n] = np.float32(0.0)
+    for light in range(len(values)):
+        for i in range(48):
+            gain[i] = gains[light, i % 3]
+        _add_scaled_run(n, address_of(values) + 12 * (light * values.shape[1] + first), address_of(gain), place)
+    gain[0] = np.float32(0.0)  # keeps it, see `_indirect_run`
+
+
+@parallel_kernel
+def sum_scaled(values, gains, out):  # type: ignore[no-untyped-def]
+    """``out = sum of values[light] * gains[light]`` in the lights' order.
+
+    Parameters
+    ----------
+    values : (n_lights, n, 3) float32
+    gains : (n_lights, 3) float32
+    out : (n, 3) float32
+    """
+    n = len(out)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        _sum_run(chunk * _CHUNK, min(n - chunk * _CHUNK, _CHUNK), values, gains, out)
 
 
 @kernel
@@ -240,6 +300,9 @@ def _film_chunk(  # type: ignore[no-untyped-def]
     more_weight,
     products,
     tint,
+    own_view,
+    own,
+    touched,
     direct,
     gains,
     throughput,
@@ -254,12 +317,28 @@ def _film_chunk(  # type: ignore[no-untyped-def]
     n = np.int64(sample_begin[end]) - first
     # As many samples as pixels, and none with two: they are the pixels.
     in_order = len(throughput) == 0 and n == end - begin
-    space = np.empty(0 if in_order else 3 * n, np.float32)
-    place = base + 12 * begin if in_order else address_of(space)
-    _sent_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, direct, gains, throughput, place)
+    sent = film[begin:end] if in_order else np.empty((n, 3), np.float32)
+    _sent_run(
+        first,
+        n,
+        row,
+        weight,
+        more_view,
+        more_row,
+        more_weight,
+        products,
+        tint,
+        own_view,
+        own,
+        touched,
+        direct,
+        gains,
+        throughput,
+        sent,
+    )
     if not in_order:
-        _sum_samples(begin, end, sample_begin, place, base)
-        space[:1] = np.float32(0.0)  # keeps it, see `_indirect_run`
+        _sum_samples(begin, end, sample_begin, address_of(sent), base)
+        sent[:1] = np.float32(0.0)  # keeps it, see `_indirect_run`
     for s in range(np.searchsorted(still_pixel, begin), np.searchsorted(still_pixel, end)):
         place = base + 12 * np.int64(still_pixel[s])
         store_rgb(place, scale_add(load_rgb(address_of(still) + 12 * s), np.float32(1.0), load_rgb(place)))
@@ -274,6 +353,9 @@ def assemble_film(  # type: ignore[no-untyped-def]
     more_weight,
     products,
     tint,
+    own_view,
+    own,
+    touched,
     direct,
     gains,
     throughput,
@@ -287,6 +369,12 @@ def assemble_film(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
+    own_view : (n_own,) int32
+        View samples, ascending, whose indirect light is not interpolated.
+    own : (n_view, 3) float32
+        Theirs.
+    touched : (n_view,) or (0,) bool
+        View samples whose indirect light is held at 0 or above.
     direct : (n_lights, n_view, 3) float32
         Reflected direct light of each light at gain 1.
     gains : (n_lights, 3) float32
@@ -318,6 +406,9 @@ def assemble_film(  # type: ignore[no-untyped-def]
             more_weight,
             products,
             tint,
+            own_view,
+            own,
+            touched,
             direct,
             gains,
             throughput,

@@ -639,27 +639,6 @@ def add_terms(
 
 
 @parallel_kernel
-def develop_pixels(pixels, sample_begin, still, throughput, direct, indirect, touched, out):  # type: ignore[no-untyped-def]
-    """``out[pixel] = still[pixel] + sum of throughput (direct + indirect)`` over the samples of some pixels.
-
-    Indirect light of samples that edits have touched is held at 0 or above.
-    """
-    for k in prange(len(pixels)):
-        pixel = pixels[k]
-        red, green, blue = still[pixel, 0], still[pixel, 1], still[pixel, 2]
-        for s in range(sample_begin[pixel], sample_begin[pixel + 1]):
-            r, g, b = indirect[s, 0], indirect[s, 1], indirect[s, 2]
-            if touched[s]:
-                r, g, b = max(r, np.float32(0)), max(g, np.float32(0)), max(b, np.float32(0))
-            red += throughput[s, 0] * (direct[s, 0] + r)
-            green += throughput[s, 1] * (direct[s, 1] + g)
-            blue += throughput[s, 2] * (direct[s, 2] + b)
-        out[pixel, 0] = red
-        out[pixel, 1] = green
-        out[pixel, 2] = blue
-
-
-@parallel_kernel
 def signatures(masks, samples, out):  # type: ignore[no-untyped-def]
     """Bits of the rows that touch each sample: whole rows in ``out[:, : n]``, soft ones in ``out[:, n :]``."""
     words = out.shape[1] // 2

@@ -14,6 +14,7 @@ from icheat_usd.edits.history import History
 from icheat_usd.edits.model import EditStack, SurfaceMask
 from icheat_usd.errors import EditError, SampleSetMismatch
 from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels.assemble import sum_scaled
 from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.groups import SampleGroups, TermTable
@@ -21,13 +22,12 @@ from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
 from icheat_usd.relight.pair_products import PairProducts
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.relighter import RelitView
-from icheat_usd.relight.shared_light import SharedLight
+from icheat_usd.relight.shared_light import OwnLight, SharedLight, seen_samples
 from icheat_usd.relight.term_tables import TermTables
 from icheat_usd.relight.versions import Versions
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.samples.develop import develop
 from icheat_usd.scene import F32, I64, Bool, SceneSnapshot
-from icheat_usd.transport import HeldBack, Transport, sum_groups
+from icheat_usd.transport import HeldBack, Transport
 from icheat_usd.transport.packed import PackedTransport
 
 #: More versions than this, and edits that have no casters in common are kept apart: a version takes a megabyte.
@@ -38,9 +38,9 @@ class Lights(Protocol):
     """What is asked of lights; see `relight.lights.LiveLights`."""
 
     radiance: F32  #: (n_lights, n_gather, 3) at gain 1
+    view_direct: F32  #: (n_lights, n_view, 3) at gain 1
     gains: F32  #: (n_lights, 3)
 
-    def total(self) -> F32: ...
     def direct(self) -> F32: ...
     def refine(self) -> bool: ...
 
@@ -75,15 +75,10 @@ class LiveRelighter:
         self.view, self.gather, self.lights, self.held_back = view, gather, lights, held_back
         self._snapshot = snapshot
         self._albedo = np.ascontiguousarray(view.points.albedo)
-        self._throughput = np.ascontiguousarray(view.throughput)
-        n_pixels = view.width * view.height
-        self._sample_begin = np.searchsorted(view.pixel, np.arange(n_pixels + 1)).astype(np.int64)
-        self._still = (view.background + develop(view, view.points.emission)).astype(np.float32)
-        self._film: F32 = np.zeros((n_pixels, 3), np.float32)
-        self._all_pixels = np.arange(n_pixels, dtype=np.int64)
-        self._direct: F32 = np.zeros((view.n, 3), np.float32)
+        self._seen = seen_samples(view)
+        self._film: F32 = np.zeros((view.width * view.height, 3), np.float32)
         self._base: F32 = np.zeros((view.n, 3), np.float32)
-        self._edited: F32 = np.zeros((view.n, 3), np.float32)
+        self._base_stale = True
         self._own: F32 = np.zeros((view.n, 3), np.float32)  # of samples that do not share their light with a group
         self._lights_seen: Any = None
         self._light_stale = True
@@ -239,9 +234,12 @@ class LiveRelighter:
     def relit(self) -> RelitView:
         """Light of every view sample, in layers."""
         self._update()
+        edited = np.empty_like(self._base)
+        self._shared.edited(edited)
+        edited[self._mixed_samples] = self._own[self._mixed_samples]
         # Held at 0 or above once, at the end, as in the film.
-        held = np.where(self._touched[:, None], np.maximum(self._edited, np.float32(0)), self._edited)
-        return RelitView(self._direct.copy(), self._base.copy(), held)
+        held = np.where(self._touched[:, None], np.maximum(edited, np.float32(0)), edited)
+        return RelitView(np.ascontiguousarray(self.lights.direct(), np.float32), self._unedited().copy(), held)
 
     def refine(self) -> bool:
         """At rest: bring lights to their final quality, then take back what packing lost; False when nothing is left.
@@ -254,10 +252,10 @@ class LiveRelighter:
         if self._exact_products is not None:
             self._versions.refine(self._exact_products)
             if not self._is_exact:
-                self._shared.set_unedited(self._by_group.sum(axis=0), self._exact_products)
-                self._shared.unedited(self._base)
+                self._shared.set_unedited(self._light(), self._exact_products)
+                self._base_stale = True
                 self._is_exact = True
-            self._show(self._mixed_samples, self._all_pixels)
+            self._show(self._mixed_samples)
         return False
 
     # Structure --------------------------------------------------------------------------------------------------------
@@ -296,7 +294,7 @@ class LiveRelighter:
         self._shared = SharedLight(self._products, self.view.n)
         self._changed_rows: set[int] = set()
         self._changed_samples: list[I64] = []
-        self._samples_of: dict[frozenset[int], tuple[I64, I64]] = {}
+        self._samples_of: dict[frozenset[int], I64] = {}
         self._light_stale = True
         self._place(np.flatnonzero((stack.receiver_masks != 0).any(axis=0)))
 
@@ -346,6 +344,8 @@ class LiveRelighter:
         self._active_rows = self._stack.active_rows
         self._touched = self._touched_by(np.flatnonzero(self._active_rows))
         self._mixed_samples = np.flatnonzero(self._mixed)
+        touched = self._touched if self._touched.any() else self._touched[:0]
+        self._own_light = OwnLight(self._mixed_samples.astype(np.int32), self._own, touched)
 
     def _touched_by(self, rows: Iterable[int]) -> Bool:
         found = np.zeros(self.view.n, np.bool_)
@@ -353,27 +353,18 @@ class LiveRelighter:
             found |= self._stack.receiver_masks[row] != 0
         return found
 
-    def _samples_of_rows(self, rows: frozenset[int]) -> tuple[I64, I64]:
-        """Samples that some rows touch, and their pixels."""
+    def _changed_places(self) -> I64:
+        """Samples to find the light of anew."""
+        rows = frozenset(self._changed_rows)
         if rows not in self._samples_of:
-            samples = np.flatnonzero(self._touched_by(rows))
-            self._samples_of[rows] = samples, self._pixels_of(samples)
-        return self._samples_of[rows]
-
-    def _changed_places(self) -> tuple[I64, I64]:
-        """Samples to find the light of anew, and their pixels."""
-        samples, pixels = self._samples_of_rows(frozenset(self._changed_rows))
+            self._samples_of[rows] = np.flatnonzero(self._touched_by(rows))
+        samples = self._samples_of[rows]
         if self._changed_samples:
             flags = np.zeros(self.view.n, np.bool_)
             for some in (samples, *self._changed_samples):
                 flags[some] = True
             samples = np.flatnonzero(flags)
-            pixels = self._pixels_of(samples)
-        return samples, pixels
-
-    def _pixels_of(self, samples: I64) -> I64:
-        pixels = self.view.pixel[samples].astype(np.int64)
-        return np.asarray(pixels[np.diff(pixels, prepend=-1) != 0])
+        return samples
 
     # Evaluation -------------------------------------------------------------------------------------------------------
 
@@ -382,35 +373,32 @@ class LiveRelighter:
         if not self._light_stale and not self._changed_rows and not self._changed_samples:
             return
         if self._light_stale:
-            b = np.ascontiguousarray(self.lights.total(), np.float32)
-            self._direct = np.ascontiguousarray(self.lights.direct(), np.float32)
-            self._by_group = self._light_by_group(b)
-            self._shared.set_unedited(b)
+            self._by_group = self._light_by_group()
+            self._shared.set_unedited(self._light())
             self._is_exact = False
-            self._shared.unedited(self._base)
+            self._base_stale = True
             self._versions.light_changed(self._by_group)
-            samples, pixels = self._mixed_samples, self._all_pixels
+            samples = self._mixed_samples
         else:
-            samples, pixels = self._changed_places()
+            samples = self._changed_places()
         self._versions.update()
-        self._show(samples, pixels)
+        self._show(samples)
         self._light_stale = False
         self._changed_rows, self._changed_samples = set(), []
 
-    def _show(self, samples: I64, pixels: I64) -> None:
-        """Put the image together, of which some samples and pixels have changed."""
-        self._shared.edited(self._terms.light, self._versions, self._edited)
+    def _show(self, samples: I64) -> None:
+        """Put the image together, after some samples that do not share their light have changed."""
+        self._shared.add_up(self._terms.light, self._versions)
         self._edit(samples)
-        kernels.develop_pixels(
-            pixels,
-            self._sample_begin,
-            self._still,
-            self._throughput,
-            self._direct,
-            self._edited,
-            self._touched,
-            self._film,
-        )
+        lights = self.lights
+        self._shared.film(self._own_light, lights.view_direct, lights.gains, self._seen, self._film)
+
+    def _unedited(self) -> F32:
+        """Unedited indirect light of all view samples."""
+        if self._base_stale:
+            self._shared.unedited(self._base)
+            self._base_stale = False
+        return self._base
 
     def _look_at_lights(self) -> None:
         revision = getattr(self.lights, "revision", None)
@@ -423,24 +411,31 @@ class LiveRelighter:
     def _light_paths(self) -> tuple[str, ...]:
         return tuple(getattr(self.lights, "paths", self._snapshot.light_paths))
 
-    def _light_by_group(self, b: F32) -> F32:
-        field = self._stack.field
-        if field.n_groups == 1:
-            return b[None]
-        return sum_groups(self.lights.radiance * self.lights.gains[:, None, :], field.light_group, field.n_groups)
+    def _light_by_group(self) -> F32:
+        """What leaves the cells, by group of lights: (G, n_gather, 3)."""
+        field, lights = self._stack.field, self.lights
+        out = np.empty((field.n_groups, self.gather.n, 3), np.float32)
+        for group in range(field.n_groups):
+            some = slice(None) if field.n_groups == 1 else field.light_group == group
+            sum_scaled(lights.radiance[some], lights.gains[some], out[group])
+        return out
+
+    def _light(self) -> F32:
+        """What leaves the cells, (n_gather, 3)."""
+        return self._by_group[0] if len(self._by_group) == 1 else self._by_group.sum(axis=0)
 
     def _edit(self, samples: I64) -> None:
         """Find the light of those of some samples that do not share theirs."""
         samples = samples[self._mixed[samples]]
         idle = samples[~self._touched[samples]]
-        self._own[idle] = self._base[idle]
+        if len(idle):
+            self._own[idle] = self._unedited()[idle]
         self._edit_mixed(samples[self._touched[samples]])
-        self._edited[self._mixed_samples] = np.take(self._own, self._mixed_samples, axis=0)
 
     def _edit_mixed(self, samples: I64) -> None:
         if not len(samples):
             return
-        light = np.take(self._base, samples, axis=0)
+        light = np.take(self._unedited(), samples, axis=0)
         self._add(self._terms.light, samples, self._aggregate_factors(samples), light)
         if self._alone_samples is not None and self._alone[samples].any():
             difference = self._alone_samples.difference(self._stack.field, self.gather, self._by_group)

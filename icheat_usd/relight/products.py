@@ -60,6 +60,7 @@ class Products:
             self._parent_of_leaf, self._parent = _parents(tree)
             self._share, self._root = _shares(tree)
             self._plan = plan_haar(tree)
+            self._unedited: F32 = np.zeros((1, self._n_leaves, 4), np.float32)
             self._paired = [
                 pair_coefficients(rows.tile_begin, rows.index, rows.scale, rows.value)
                 if rows.value.dtype == np.int8
@@ -142,7 +143,7 @@ class Products:
     def multiply_all(self, b: F32, out: F32) -> None:
         """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``."""
         if self._haar:
-            values = haar_of_versions(self._plan, b[None])
+            values = haar_of_versions(self._plan, b[None], self._unedited)
         else:
             values = np.zeros((1, self._n_leaves, 4), np.float32)
             values[0, :, :3] = b

@@ -2,15 +2,48 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
-from icheat_usd.kernels.assemble import InterpolationTable, assemble_view, interpolation_table
+from icheat_usd.kernels.assemble import InterpolationTable, assemble_film, assemble_view, interpolation_table
 from icheat_usd.relight.groups import SampleGroups, TermTable
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.versions import Versions
+from icheat_usd.samples import ViewSamples
+from icheat_usd.samples.develop import develop
 from icheat_usd.scene import F32, I32, I64, Bool
 from icheat_usd.transport.packed import LANES
+
+
+class OwnLight(NamedTuple):
+    """Indirect light that samples do not share with a group; see `assemble_film`."""
+
+    samples: I32  #: ascending
+    light: F32  #: (n_view, 3)
+    touched: Bool  #: (n_view,) or (0,) if none is
+
+
+class SeenSamples(NamedTuple):
+    """How view samples make pixels; see `assemble_film`."""
+
+    throughput: F32
+    sample_begin: I32
+    pixel: I32
+    still_pixel: I32
+    still: F32
+
+
+def seen_samples(view: ViewSamples) -> SeenSamples:
+    """Those of a view, with its background and what glows."""
+    begin = np.searchsorted(view.pixel, np.arange(view.width * view.height + 1)).astype(np.int32)
+    still = (view.background + develop(view, view.points.emission)).astype(np.float32)
+    shown = np.flatnonzero(still.any(axis=1)).astype(np.int32)
+    plain = bool((view.throughput == 1).all()) and np.diff(begin).max(initial=0) <= 1
+    throughput = np.zeros((0, 3), np.float32) if plain else np.ascontiguousarray(view.throughput, np.float32)
+    pixel = np.ascontiguousarray(view.pixel, np.int32)
+    return SeenSamples(throughput, begin, pixel, shown, np.ascontiguousarray(still[shown]))
 
 
 class SharedLight:
@@ -77,8 +110,8 @@ class SharedLight:
         """Unedited indirect light of all view samples into `out`."""
         self._assemble(self._base, out)
 
-    def edited(self, terms: TermTable, versions: Versions, out: F32) -> None:
-        """Light of all view samples into `out`: edited where a group shares it, else unedited."""
+    def add_up(self, terms: TermTable, versions: Versions) -> None:
+        """Make the sums of groups from the products of their terms."""
         if len(self._tile):
             kernels.sum_products(
                 self._tile,
@@ -90,11 +123,22 @@ class SharedLight:
                 self._products.n_tiles,
                 self._sums,
             )
+
+    def edited(self, out: F32) -> None:
+        """Indirect light of all view samples into `out`: edited where a group shares it, else unedited."""
         self._assemble(self._edited, out)
 
+    def film(self, own: OwnLight, lights: F32, gains: F32, seen: SeenSamples, out: F32) -> None:
+        """The image with direct light (n_lights, n_view, 3) under gains into `out` (n_pixels, 3)."""
+        assemble_film(*self._edited, self._flat_sums, self._products.tints, *own, lights, gains, *seen, out)
+
+    @property
+    def _flat_sums(self) -> F32:
+        n_lobes, n_sums = self._sums.shape[:2]
+        return self._sums.reshape(n_lobes, n_sums * LANES, 4)
+
     def _assemble(self, table: InterpolationTable, out: F32) -> None:
-        sums = self._sums
-        assemble_view(*table, sums.reshape(len(sums), -1, 4), self._products.tints, out)
+        assemble_view(*table, self._flat_sums, self._products.tints, out)
 
 
 def _entries_of(view: I32, samples: I64) -> I64:

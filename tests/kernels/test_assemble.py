@@ -6,7 +6,13 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.assemble import InterpolationTable, assemble_film, assemble_view, interpolation_table
+from icheat_usd.kernels.assemble import (
+    InterpolationTable,
+    assemble_film,
+    assemble_view,
+    interpolation_table,
+    sum_scaled,
+)
 from icheat_usd.scene import F32, F64, I32
 from icheat_usd.transport import SparseRows
 
@@ -63,7 +69,12 @@ def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
     still = colors(100, 3)
     begin = np.concatenate([[0], np.cumsum(per_pixel)]).astype(np.int32)
 
-    sent = expected_view(rows, products, tint) + (gains[:, None].astype(np.float64) * direct).sum(axis=0)
+    own_view = np.sort(rng.choice(n, 200, replace=False)).astype(np.int32)
+    own, touched = colors(n, 3) - np.float32(0.5), rng.uniform(size=n) < 0.4
+    indirect = expected_view(rows, products, tint)
+    indirect[own_view] = own[own_view]
+    indirect[touched] = np.maximum(indirect[touched], 0)
+    sent = indirect + (gains[:, None].astype(np.float64) * direct).sum(axis=0)
     expected = np.zeros((n_pixels, 3))
     np.add.at(expected, pixel, sent * (throughput if len(throughput) else 1))
     expected[still_pixel] += still
@@ -73,14 +84,21 @@ def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
         for n_threads in (1, before):
             numba.set_num_threads(n_threads)
             film = np.full((n_pixels, 3), np.nan, np.float32)
-            assemble_film(
-                *table_of(rows), products, tint, direct, gains, throughput, begin, pixel, still_pixel, still, film
-            )
+            edited = (own_view, own, touched)
+            seen = (throughput, begin, pixel, still_pixel, still)
+            assemble_film(*table_of(rows), products, tint, *edited, direct, gains, *seen, film)
             films.append(film)
     finally:
         numba.set_num_threads(before)
     np.testing.assert_allclose(films[0], expected, rtol=2e-6, atol=1e-7)
     np.testing.assert_array_equal(films[0], films[1])
+
+
+def test_sum_of_lights() -> None:
+    values, gains = colors(3, 2500, 3), colors(3, 3)
+    out = np.full((2500, 3), np.nan, np.float32)
+    sum_scaled(values, gains, out)
+    np.testing.assert_allclose(out, (values.astype(np.float64) * gains[:, None]).sum(axis=0), rtol=1e-6)
 
 
 def test_weights_of_the_table_are_those_of_the_matrix() -> None:

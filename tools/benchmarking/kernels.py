@@ -330,6 +330,8 @@ def measure_frame(
     still = np.flatnonzero(view.background.any(axis=1)).astype(np.int32)
     background = np.ascontiguousarray(view.background[still])
     film = np.empty((n_pixels, 3), np.float32)
+    unedited = (np.zeros(0, np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.bool_))
+    seen = (throughput, sample_begin, view.pixel, still, background)
 
     def haar() -> None:
         haar_of_versions(plan, values, products[0].coefficients)
@@ -343,7 +345,7 @@ def measure_frame(
             item.in_integers()
 
     def pixels() -> None:
-        assemble_film(*table, out, tint, direct, gains, throughput, sample_begin, view.pixel, still, background, film)
+        assemble_film(*table, out, tint, *unedited, direct, gains, *seen, film)
 
     def frame() -> None:
         haar()
