@@ -22,6 +22,7 @@ NO_FACES = -(1 << 40)  # a placement without entries
 BLOCK = 4  # squares along a side of a block, which shares one search for candidates
 MOST = 12  # candidates of a square; more are looked up in the tree
 _SEARCHED = 512  # candidates of a block
+_TOGETHER = 32  # blocks that share buffers
 _FINEST = 4096  # squares along an edge
 
 
@@ -172,10 +173,10 @@ def divide_faces(points, to_world, locator, spacing, fineness, placed_instance, 
 
 
 @kernel
-def _within(locator, begin, end, root, c, n, detour, radius, reach2, stack, found):  # type: ignore[no-untyped-def]
+def _within(record, sample, begin, end, root, c, n, detour, radius, reach2, stack, found):  # type: ignore[no-untyped-def]
     """Samples that may be nearest to a place no further than `radius` from `c`; their number, or -1 for too many."""
-    record, sample = locator.record, locator.sample
     count = 0
+    reach = np.sqrt(reach2) + radius  # of the distance from `c`
     stack[0, 0], stack[0, 1] = (root, 0) if root >= 0 else (-1 - begin, end - begin)
     depth = 1
     while depth > 0:
@@ -187,7 +188,7 @@ def _within(locator, begin, end, root, c, n, detour, radius, reach2, stack, foun
                 for a in range(3):
                     low, high = record[what, first + a] - c[a], c[a] - record[what, first + 3 + a]
                     d2 += max(low, high, 0.0) ** 2
-                if max(0.0, np.sqrt(d2) - radius) ** 2 <= reach2:
+                if d2 <= reach * reach:
                     stack[depth, 0], stack[depth, 1] = record[what, first + 6], record[what, first + 7]
                     depth += 1
             continue
@@ -195,52 +196,69 @@ def _within(locator, begin, end, root, c, n, detour, radius, reach2, stack, foun
             d2 = 0.0
             for a in range(3):
                 d2 += (sample[j, a] - c[a]) ** 2
-            extra = detour if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE else 0.0
-            if max(0.0, np.sqrt(d2) - radius) ** 2 + extra <= reach2:
-                if count == len(found):
-                    return -1
-                found[count] = j
-                count += 1
+            if d2 > reach * reach:
+                continue
+            if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE:
+                if max(0.0, np.sqrt(d2) - radius) ** 2 + detour > reach2:
+                    continue
+            if count == len(found):
+                return -1
+            found[count] = j
+            count += 1
     return count
 
 
 @kernel
-def _nearest_somewhere(distance, n, n_corners, slack, kept):  # type: ignore[no-untyped-def]
-    """Which of n samples no other one beats at all corners of a convex region: `distance` (n, 4) are squared.
+def _nearest_somewhere(g, n, slack, kept):  # type: ignore[no-untyped-def]
+    """Which of n samples no other one beats at all four corners of a convex region; `kept` has room for two sets.
 
-    A difference of squared distances is linear in the place, so the corners decide.
+    `g` (4, n) are squared distances, less a function of the place that all
+    samples share. Differences of them are linear in the place, so the corners decide.
     """
     best, least = 0, np.inf
     for j in range(n):
-        largest = 0.0
-        for c in range(n_corners):
-            largest = max(largest, distance[j, c])
+        largest = max(max(g[0, j], g[1, j]), max(g[2, j], g[3, j]))
         if largest < least:
             best, least = j, largest
+    limit_0, limit_1, limit_2, limit_3 = g[0, best] + slack, g[1, best] + slack, g[2, best] + slack, g[3, best] + slack
     count = 0
     for j in range(n):
-        for c in range(n_corners):
-            if distance[j, c] <= distance[best, c] + slack:
-                kept[count] = j
-                count += 1
-                break
+        if (g[0, j] <= limit_0) | (g[1, j] <= limit_1) | (g[2, j] <= limit_2) | (g[3, j] <= limit_3):
+            kept[count] = j
+            count += 1
+    if count == 1:
+        return count
     left = 0
     for a in range(count):
+        j = kept[a]
         beaten = False
         for b in range(count):
-            everywhere = a != b
-            for c in range(n_corners):
-                everywhere = everywhere and distance[kept[a], c] > distance[kept[b], c] + slack
-            if everywhere:
-                beaten = True
-                break
+            k = kept[b]
+            beaten |= (
+                (g[0, j] > g[0, k] + slack)
+                & (g[1, j] > g[1, k] + slack)
+                & (g[2, j] > g[2, k] + slack)
+                & (g[3, j] > g[3, k] + slack)
+            )
         if not beaten:
             # Entries before `a` are still compared against, so what is left goes behind them.
-            kept[count + left] = kept[a]
+            kept[count + left] = j
             left += 1
     for a in range(left):
         kept[a] = kept[count + a]
     return left
+
+
+@kernel
+def _at_corners(term, n, u0, u1, v0, v1, whole, g):  # type: ignore[no-untyped-def]
+    """``term[0] + u term[1] + v term[2]`` of n samples at the corners of a rectangle in (u, v), or of a triangle."""
+    for j in range(n):
+        at = term[0, j] + u0 * term[1, j] + v0 * term[2, j]
+        along_u, along_v = (u1 - u0) * term[1, j], (v1 - v0) * term[2, j]
+        g[0, j] = at
+        g[1, j] = at + along_u
+        g[2, j] = at + along_v
+        g[3, j] = at if whole else at + along_u + along_v
 
 
 @parallel_kernel
@@ -251,117 +269,134 @@ def find_candidates(  # type: ignore[no-untyped-def]
 
     Block ``block_number[b]``, row by row, of side ``block_face[b]``.
     """
-    for b in prange(len(block_face)):
-        side = block_face[b] % 2
-        p = block_face[b] // 2
-        i = placed_instance[p]
-        t = p - place[i]
-        count[b, :] = -1
-        slot = locator.slot[2 * i + side]
-        begin, end = locator.slot_begin[slot], locator.slot_begin[slot + 1]
-        if end - begin == 1:
-            count[b, 0] = 1
-            found[b, 0, 0] = begin
-            continue
-        plane = plane_of(points, to_object, i, t)
-        if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
-            continue
-        n = unit_normal(plane, side)
-        corner, e, f = placed_triangle(points, to_world, i, t)
-        along_u, along_v = divided[block_face[b], 0], divided[block_face[b], 1]
-        blocks_u = (along_u + BLOCK - 1) // BLOCK
-        first_u, first_v = BLOCK * (block_number[b] % blocks_u), BLOCK * (block_number[b] // blocks_u)
-        last_u, last_v = min(first_u + BLOCK, along_u), min(first_v + BLOCK, along_v)
-        whole = along_u == 1 and along_v == 1
-        if first_u / along_u + first_v / along_v > 1.0 + 1e-3:
-            continue
-
-        # The ball around the block, and the samples that can be nearest in it.
-        n_corners = 3 if whole else 4
-        u0, u1, v0, v1 = first_u / along_u, last_u / along_u, first_v / along_v, last_v / along_v
-        if whole:
-            um, vm = 1.0 / 3.0, 1.0 / 3.0
-        else:
-            um, vm = 0.5 * (u0 + u1), 0.5 * (v0 + v1)
-        c = (
-            corner[0] + um * e[0] + vm * f[0],
-            corner[1] + um * e[1] + vm * f[1],
-            corner[2] + um * e[2] + vm * f[2],
-        )
-        radius = 0.0
-        for k in range(n_corners):
-            du = (u1 if k % 2 == 1 else u0) - um
-            dv = (v1 if k // 2 == 1 else v0) - vm
-            x, y, z = du * e[0] + dv * f[0], du * e[1] + dv * f[1], du * e[2] + dv * f[2]
-            radius = max(radius, np.sqrt(x * x + y * y + z * z))
-        radius *= 1.01
-        detour = np.float64(locator.slot_detour[slot])
+    record, sample = locator.record, locator.sample
+    slots, slot_begin, slot_record, slot_detour = (
+        locator.slot,
+        locator.slot_begin,
+        locator.slot_record,
+        locator.slot_detour,
+    )
+    n_blocks = len(block_face)
+    for chunk in prange((n_blocks + _TOGETHER - 1) // _TOGETHER):
         stack = np.empty((2 * depth + 2, 2), np.int64)
         bound = np.empty(depth + 1, np.float32)
-        j = nearest_sample(
-            locator, i, side, np.float32(c[0]), np.float32(c[1]), np.float32(c[2]), n[0], n[1], n[2], stack, bound
-        )
-        sample = locator.sample
-        d2 = 0.0
-        largest = 0.0  # coordinate, which the rounding of a place is relative to
-        for a in range(3):
-            d2 += (sample[j, a] - c[a]) ** 2
-            largest = max(largest, abs(sample[j, a]) + radius)
-        rounding = largest * 2.0**-22
-        reach2 = (np.sqrt(d2) + radius + rounding) ** 2
-        if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE:
-            reach2 += detour
         near = np.empty(_SEARCHED, np.int64)
-        number = _within(
-            locator,
-            begin,
-            end,
-            np.int64(locator.slot_record[slot]),
-            c,
-            n,
-            detour,
-            radius + rounding,
-            1.0001 * reach2,
-            stack,
-            near,
-        )
-        if number < 0:
-            continue
-        near = np.sort(near[:number])
-        distance = np.empty((number, 4), np.float64)
-        kept = np.empty(2 * number, np.int64)
-        for b_v in range(first_v, last_v):
-            for b_u in range(first_u, last_u):
-                # A little larger than the square: rounding may put a place on its border into its neighbour.
-                grow = 1e-3
-                lowest_u, highest_u = (b_u - grow) / along_u, (b_u + 1 + grow) / along_u
-                lowest_v, highest_v = (b_v - grow) / along_v, (b_v + 1 + grow) / along_v
-                if lowest_u + lowest_v > 1.0 + grow:
-                    continue
-                far2 = 0.0
-                for k in range(n_corners):
-                    u = highest_u if k % 2 == 1 else lowest_u
-                    v = highest_v if k // 2 == 1 else lowest_v
-                    if whole:  # the corner between the other two, further out
-                        u = 1.0 + 2 * grow if k == 1 else -grow
-                        v = 1.0 + 2 * grow if k == 2 else -grow
-                    x = corner[0] + u * e[0] + v * f[0]
-                    y = corner[1] + u * e[1] + v * f[1]
-                    z = corner[2] + u * e[2] + v * f[2]
+        kept = np.empty(2 * _SEARCHED, np.int64)
+        term = np.empty((3, _SEARCHED), np.float64)
+        g = np.empty((4, _SEARCHED), np.float64)
+        for b in range(chunk * _TOGETHER, min(n_blocks, (chunk + 1) * _TOGETHER)):
+            side = block_face[b] % 2
+            p = block_face[b] // 2
+            i = placed_instance[p]
+            t = p - place[i]
+            for q in range(BLOCK * BLOCK):
+                count[b, q] = -1
+            slot = slots[2 * i + side]
+            begin, end = slot_begin[slot], slot_begin[slot + 1]
+            if end - begin == 1:
+                count[b, 0] = 1
+                found[b, 0, 0] = begin
+                continue
+            plane = plane_of(points, to_object, i, t)
+            if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
+                continue
+            along_u, along_v = np.int64(divided[block_face[b], 0]), np.int64(divided[block_face[b], 1])
+            blocks_u = (along_u + BLOCK - 1) // BLOCK
+            first_u, first_v = BLOCK * (block_number[b] % blocks_u), BLOCK * (block_number[b] // blocks_u)
+            last_u, last_v = min(first_u + BLOCK, along_u), min(first_v + BLOCK, along_v)
+            if first_u / along_u + first_v / along_v > 1.0 + 1e-3:
+                continue
+            n = unit_normal(plane, side)
+            corner, e, f = placed_triangle(points, to_world, i, t)
+            whole = along_u == 1 and along_v == 1
+            # A little larger than the block: rounding may put a place on its border into its neighbour.
+            grow = 1e-3
+            u0, u1 = (first_u - grow) / along_u, (last_u + grow) / along_u
+            v0, v1 = (first_v - grow) / along_v, (last_v + grow) / along_v
+            if whole:  # the corner between the other two, further out
+                u1, v1 = 1.0 + 2 * grow, 1.0 + 2 * grow
+
+            # The ball around the block, and the samples that can be nearest in it.
+            um, vm = 0.5 * (u0 + u1), 0.5 * (v0 + v1)
+            if whole:
+                um, vm = 1.0 / 3.0, 1.0 / 3.0
+            c = (
+                corner[0] + um * e[0] + vm * f[0],
+                corner[1] + um * e[1] + vm * f[1],
+                corner[2] + um * e[2] + vm * f[2],
+            )
+            radius2 = 0.0
+            for k in range(3 if whole else 4):
+                du = (u1 if k % 2 == 1 else u0) - um
+                dv = (v1 if k // 2 == 1 else v0) - vm
+                x, y, z = du * e[0] + dv * f[0], du * e[1] + dv * f[1], du * e[2] + dv * f[2]
+                radius2 = max(radius2, x * x + y * y + z * z)
+            radius = 1.01 * np.sqrt(radius2)
+            detour = np.float64(slot_detour[slot])
+            j = nearest_sample(
+                locator, i, side, np.float32(c[0]), np.float32(c[1]), np.float32(c[2]), n[0], n[1], n[2], stack, bound
+            )
+            d2 = 0.0
+            largest = 0.0  # coordinate, which the rounding of a place is relative to
+            for a in range(3):
+                d2 += (sample[j, a] - c[a]) ** 2
+                largest = max(largest, abs(sample[j, a]) + radius)
+            rounding = largest * 2.0**-22
+            reach2 = (np.sqrt(d2) + radius + rounding) ** 2
+            if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE:
+                reach2 += detour
+            root = np.int64(slot_record[slot])
+            number = _within(
+                record, sample, begin, end, root, c, n, detour, radius + rounding, 1.0001 * reach2, stack, near
+            )
+            if number < 0:
+                continue
+            for a in range(1, number):  # ascending, as lists are
+                j = near[a]
+                k = a
+                while k > 0 and near[k - 1] > j:
+                    near[k] = near[k - 1]
+                    k -= 1
+                near[k] = j
+
+            # Squared distances along the triangle, about the middle of the ball: a term that all samples share,
+            # and one that is linear in the place. The whole block first: who loses all over it needs no square.
+            for step in range(2):
+                far = 0.0
+                for a in range(number):
+                    j = near[a]
+                    x, y, z = sample[j, 0] - c[0], sample[j, 1] - c[1], sample[j, 2] - c[2]
+                    along_e, along_f = x * e[0] + y * e[1] + z * e[2], x * f[0] + y * f[1] + z * f[2]
+                    d2 = x * x + y * y + z * z
+                    if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE:
+                        d2 += detour
+                    far = max(far, np.sqrt(d2))
+                    term[0, a] = d2 + 2.0 * (um * along_e + vm * along_f)
+                    term[1, a] = -2.0 * along_e
+                    term[2, a] = -2.0 * along_f
+                far += radius
+                slack = 1e-5 * far * far + 4.0 * rounding * far
+                if step == 0:
+                    _at_corners(term, number, u0, u1, v0, v1, whole, g)
+                    number = _nearest_somewhere(g, number, slack, kept)
                     for a in range(number):
-                        j = near[a]
-                        d2 = (sample[j, 0] - x) ** 2 + (sample[j, 1] - y) ** 2 + (sample[j, 2] - z) ** 2
-                        if sample[j, 3] * n[0] + sample[j, 4] * n[1] + sample[j, 5] * n[2] <= AGREE:
-                            d2 += detour
-                        distance[a, k] = d2
-                        far2 = max(far2, d2)
-                slack = 1e-5 * far2 + 4.0 * rounding * np.sqrt(far2)
-                left = _nearest_somewhere(distance, number, n_corners, slack, kept)
-                q = (b_v - first_v) * BLOCK + b_u - first_u
-                if left <= MOST:
+                        near[a] = near[kept[a]]
+            for b_v in range(first_v, last_v):
+                for b_u in range(first_u, last_u):
+                    if b_u / along_u + b_v / along_v > 1.0 + 3 * grow:
+                        continue
+                    left = number
+                    if number > 1 and not whole:
+                        lowest_u, highest_u = (b_u - grow) / along_u, (b_u + 1 + grow) / along_u
+                        lowest_v, highest_v = (b_v - grow) / along_v, (b_v + 1 + grow) / along_v
+                        _at_corners(term, number, lowest_u, highest_u, lowest_v, highest_v, False, g)
+                        left = _nearest_somewhere(g, number, slack, kept)
+                    q = (b_v - first_v) * BLOCK + b_u - first_u
+                    if left > MOST:
+                        continue
                     count[b, q] = left
                     for a in range(left):
-                        found[b, q, a] = near[kept[a]]
+                        found[b, q, a] = near[a] if left == number else near[kept[a]]
 
 
 @parallel_kernel
