@@ -15,6 +15,9 @@ FINENESS = 0.5
 #: Placed triangles with entries; placements with the most triangles per sample go without beyond it.
 MOST_PLACED = 3_000_000
 _BLOCKS_AT_ONCE = 8192  # 6 MB of candidates
+# Look-ups that cost as much more without a map as making one: measured in a room of 143,000 triangles, 8,192 and
+# 65,536 samples.
+_WORTH_PER_TRIANGLE, _WORTH_PER_SAMPLE = 4, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +29,28 @@ class CellMap:
     @property
     def n_bytes(self) -> int:
         return sum(column.nbytes for column in self.table)
+
+
+class HitCells:
+    """The cell map of a gather set, made once look-ups are so many that it saves time; they find the same without."""
+
+    def __init__(self, locator: Locator) -> None:
+        self._locator = locator
+        self._asked = 0
+        self._map: CellMap | None = None
+
+    def table(self, geometry: Geometry, n_hits: int) -> kernels.CellTable:
+        """What to look up `n_hits` hits by; without entries while there is no map."""
+        self._asked += n_hits
+        if self._map is None:
+            triangles = min(int(np.diff(geometry.mesh_begin)[geometry.instance_mesh].sum()), MOST_PLACED)
+            samples = len(self._locator.table.sample)
+            if self._asked < _WORTH_PER_TRIANGLE * triangles + _WORTH_PER_SAMPLE * samples:
+                place = np.full(len(geometry.instance_mesh), kernels.NO_FACES)
+                nothing = np.zeros(0, np.int32)
+                return kernels.CellTable(place, np.zeros((0, 3), np.int32), nothing, nothing)
+            self._map = build_cell_map(geometry, self._locator)
+        return self._map.table
 
 
 def build_cell_map(geometry: Geometry, locator: Locator, *, fineness: float = FINENESS) -> CellMap:

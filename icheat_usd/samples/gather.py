@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from icheat_usd.kernels import samples as kernels
 from icheat_usd.kernels.rows import mean_over_segments
 from icheat_usd.lighting import LightSampler, irradiance
 from icheat_usd.materials import concatenate_points, effective_albedo, points_on_surface, take_points
-from icheat_usd.samples.cell_map import CellMap, build_cell_map
+from icheat_usd.samples.cell_map import HitCells
 from icheat_usd.samples.locate import Locator, build_locator
 from icheat_usd.samples.tree import ClusterTree, build_tree, split_samples
 from icheat_usd.samples.view import ViewSamples
@@ -42,11 +43,15 @@ class GatherSamples:
     locator: Locator
     n_shared_clusters: int  #: cells that stand for several sides of surfaces, because `n` was too small
     n_surfaces_without_own: int  #: instances with area that have no cell of their own
-    cell_map: CellMap | None = None  #: finds cells of hits faster than the locator
 
     @property
     def n(self) -> int:
         return len(self.area)
+
+    @cached_property
+    def hit_cells(self) -> HitCells:
+        """Finds cells of hits faster than `locate`."""
+        return HitCells(self.locator)
 
     def locate(self, points: SurfacePoints) -> I32:
         """Cell of each point; -1 where a point is no hit (``instance == -1``)."""
@@ -135,7 +140,6 @@ def gather_samples(
         locator=locator,
         n_shared_clusters=slots.shared,
         n_surfaces_without_own=slots.without_own,
-        cell_map=build_cell_map(snapshot.geometry, locator),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +11,12 @@ import numpy as np
 from icheat_usd.kernels import gather_rows as gather_kernels
 from icheat_usd.kernels import rows as row_kernels
 from icheat_usd.kernels import transport as kernels
+from icheat_usd.kernels.cell_map import CellTable
 from icheat_usd.kernels.embree import TraceTable
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.materials import sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples
-from icheat_usd.samples.cell_map import CellMap, build_cell_map
 from icheat_usd.scene import F32, I32, I64, U8, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points, transmittance
 from icheat_usd.transport.sky import SkyBins
@@ -63,6 +62,7 @@ class RowBuilder:
     def __init__(self, snapshot: SceneSnapshot, tracer: Tracer, gather: GatherSamples, seed: int) -> None:
         self._snapshot, self._tracer, self._gather, self._seed = snapshot, tracer, gather, seed
         self._route = routed_triangles(snapshot)
+        self._hit_cells = gather.hit_cells
 
     def diffuse_rows(
         self,
@@ -126,13 +126,14 @@ class RowBuilder:
             first_ray + n_rays if of_rays is None else of_rays,
         )
         table = self._trace_table()
+        lookup = self._hit_cells.table(self._snapshot.geometry, len(stream) * n_rays)
         n_keys = self._gather.n + (sky.n if sky else 0)
         counter = _Counter(n_keys)
 
         def row_chunk(first: int, last: int) -> SparseRows:
             part = rays.rows(first, last)
             if table is not None:
-                return self._count_hits(table, part, sky, counter)
+                return self._count_hits(table, lookup, part, sky, counter)
             n = last - first
             row, ray = np.repeat(np.arange(n), n_rays), np.tile(np.arange(first_ray, first_ray + n_rays), n)
             return _counted(row, *self._ends(part, row, ray, sky), n, n_keys)
@@ -145,7 +146,9 @@ class RowBuilder:
     def _trace_table(self) -> TraceTable | None:
         return self._tracer.compiled()
 
-    def _count_hits(self, trace: TraceTable, rays: _Rays, sky: SkyBins | None, counter: _Counter) -> SparseRows:
+    def _count_hits(
+        self, trace: TraceTable, lookup: CellTable, rays: _Rays, sky: SkyBins | None, counter: _Counter
+    ) -> SparseRows:
         """Units of light that arrive from cells and, in columns behind them, bins of the sky."""
         geometry, gather = self._snapshot.geometry, self._gather
         n = len(rays.stream)
@@ -154,7 +157,7 @@ class RowBuilder:
         detour = np.empty((n, rays.n_rays), np.int32)
         gather_kernels.count_hits(
             trace,
-            self._cell_map.table,
+            lookup,
             gather.locator.table,
             gather.locator.depth,
             geometry.points,
@@ -295,7 +298,7 @@ class RowBuilder:
         detour = np.empty(len(origins), np.uint8)
         geometry, locator = self._snapshot.geometry, self._gather.locator
         kernels.cells_of_hits(
-            self._cell_map.table,
+            self._hit_cells.table(geometry, len(origins)),
             locator.table,
             locator.depth,
             geometry.points,
@@ -320,10 +323,6 @@ class RowBuilder:
         weight = np.ones(len(cell), np.float32)
         weight[rest] = ends.throughput.mean(axis=1)
         return cell, weight
-
-    @cached_property
-    def _cell_map(self) -> CellMap:
-        return self._gather.cell_map or build_cell_map(self._snapshot.geometry, self._gather.locator)
 
     def _merge(self, cell: I32, weight: F32, n_rays: int) -> tuple[SparseRows, F32]:
         """Rows of the first column of `weight` (n, k), and the last column's weights of the same entries."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numba
@@ -13,7 +14,7 @@ from icheat_usd.kernels.random import sobol_pair
 from icheat_usd.kernels.transport import cells_of_hits
 from icheat_usd.materials import points_on_surface, take_points
 from icheat_usd.samples import GatherSamples, gather_samples, view_samples
-from icheat_usd.samples.cell_map import build_cell_map
+from icheat_usd.samples.cell_map import HitCells, build_cell_map
 from icheat_usd.samples.view import ViewSamples
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
@@ -69,7 +70,9 @@ def prepared(open_scene: bool) -> tuple[SceneSnapshot, Tracer, ViewSamples, Gath
     scene = porch() if open_scene else cornell(10, 10)
     tracer = build_tracer(scene)
     view = view_samples(scene, tracer)
-    return scene, tracer, view, gather_samples(scene, tracer, view, n=600)
+    gather = gather_samples(scene, tracer, view, n=600)
+    gather.hit_cells.table(scene.geometry, 1 << 40)  # enough look-ups for a map
+    return scene, tracer, view, gather
 
 
 def measure(
@@ -286,10 +289,25 @@ def test_placements_with_too_many_triangles_go_without_a_table(monkeypatch: pyte
     table = build_cell_map(scene.geometry, gather.locator).table
     assert np.any(table.place == cell_kernels.NO_FACES) and np.any(table.place != cell_kernels.NO_FACES)
     whole = measure(n_rays=50)
-    bare = RowBuilder(scene, tracer, gather, 3)
-    bare.__dict__["_cell_map"] = build_cell_map(scene.geometry, gather.locator)
+    bare = replace(gather)
+    assert len(bare.hit_cells.table(scene.geometry, 1 << 40).face) == len(table.face)
     stream = np.arange(view.n)
-    assert_all_same(whole, bare.measure(view.points, np.arange(view.n + 1), stream, 50, 0, sky=SKY))
+    builder = RowBuilder(scene, tracer, bare, 3)
+    assert_all_same(whole, builder.measure(view.points, np.arange(view.n + 1), stream, 50, 0, sky=SKY))
+
+
+def test_few_look_ups_go_without_a_map_and_find_the_same() -> None:
+    scene, tracer, view, gather = prepared(True)
+    mapped = measure(n_rays=50)
+    fresh = replace(gather)
+    stream, begin = np.arange(view.n), np.arange(view.n + 1)
+    walked = RowBuilder(scene, tracer, fresh, 3).measure(view.points, begin, stream, 50, 0, sky=SKY)
+    assert_all_same(mapped, walked)
+    triangles = np.diff(scene.geometry.mesh_begin)[scene.geometry.instance_mesh].sum()
+    look_ups = HitCells(gather.locator)
+    assert len(look_ups.table(scene.geometry, 1000).face) == 0
+    assert len(look_ups.table(scene.geometry, 4 * int(triangles) + 16 * gather.n).face) == 2 * triangles
+    assert len(look_ups.table(scene.geometry, 1).face) == 2 * triangles
 
 
 def test_the_sequence_is_sobols() -> None:
