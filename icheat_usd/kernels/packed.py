@@ -130,7 +130,7 @@ def _scale_pairs(begin, end, index, scale, value, coefficients, even, odd, bound
 
 
 @kernel
-def _choose_steps(n, bounds, steps, per_step):  # type: ignore[no-untyped-def]
+def choose_steps(n, bounds, steps, per_step):  # type: ignore[no-untyped-def]
     """Units (4,) of the words of each channel, and four times their inverse, for `n` coefficients."""
     for i in range(16):
         c = i % 4
@@ -139,7 +139,7 @@ def _choose_steps(n, bounds, steps, per_step):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _round_pairs(n, even, odd, per_step, pairs):  # type: ignore[no-untyped-def]
+def round_pairs(n, even, odd, per_step, pairs):  # type: ignore[no-untyped-def]
     """`n` pairs of colours in steps, as int16; whole vectors, so up to three pairs more."""
     factor = load(address_of(per_step))
     for offset in range(0, 16 * n, 64):
@@ -173,7 +173,7 @@ def _multiply_pairs(begin, end, value, pairs, steps, out):  # type: ignore[no-un
 
 
 @kernel
-def _costs(tile_begin, pair_tile):  # type: ignore[no-untyped-def]
+def sum_costs(tile_begin, pair_tile):  # type: ignore[no-untyped-def]
     """Work up to and with each pair (n,)."""
     total = 0
     cost_end = np.empty(len(pair_tile), np.int64)
@@ -184,7 +184,7 @@ def _costs(tile_begin, pair_tile):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _share(cost_end, part):  # type: ignore[no-untyped-def]
+def share(cost_end, part):  # type: ignore[no-untyped-def]
     """First item of a part when items are divided into runs of equal cost; `cost_end` (n,) sums the costs."""
     if part == _PARTS or len(cost_end) == 0:
         return len(cost_end)
@@ -216,15 +216,15 @@ def _multiply_paired_run(  # type: ignore[no-untyped-def]
     tile_begin, index, scale, value, coefficients, pair_tile, pair_version, first, last, out
 ):
     """Pairs `first` to `last`, in integers."""
-    room = _most_coefficients(tile_begin, pair_tile, first, last) // 2 + 4  # `_round_pairs` works in whole vectors
+    room = _most_coefficients(tile_begin, pair_tile, first, last) // 2 + 4  # `round_pairs` works in whole vectors
     space = np.empty((3 * room + 7, 4), np.float32)  # one allocation: six cost as much as a tile
     even, odd, pairs = space[:room], space[room : 2 * room], space[2 * room : 3 * room]
     bounds, steps, per_step = space[3 * room : 3 * room + 2], space[3 * room + 2], space[3 * room + 3 :].reshape(16)
     for p in range(first, last):
         begin, end = tile_begin[pair_tile[p]], tile_begin[pair_tile[p] + 1]
         _scale_pairs(begin, end, index, scale, value, coefficients[pair_version[p]], even, odd, bounds)
-        _choose_steps(end - begin, bounds, steps, per_step)
-        _round_pairs((end - begin) // 2, even, odd, per_step, pairs)
+        choose_steps(end - begin, bounds, steps, per_step)
+        round_pairs((end - begin) // 2, even, odd, per_step, pairs)
         _multiply_pairs(begin, end, value, pairs, steps, out[p])
 
 
@@ -256,9 +256,9 @@ def multiply_tiles(  # type: ignore[no-untyped-def]
     Sums run in the order of the tile's coefficients, so a product has the same
     bits whatever other pairs or threads there are.
     """
-    cost_end = _costs(tile_begin, pair_tile)
+    cost_end = sum_costs(tile_begin, pair_tile)
     for part in prange(_PARTS):
-        first, last = _share(cost_end, part), _share(cost_end, part + 1)
+        first, last = share(cost_end, part), share(cost_end, part + 1)
         _multiply_run(tile_begin, index, scale, value, coefficients, pair_tile, pair_version, first, last, out)
 
 
@@ -281,7 +281,7 @@ def multiply_paired_tiles(  # type: ignore[no-untyped-def]
     (or slightly more, where 32 bits could overflow): small against the half
     quantum that the transport was rounded by. Sums of integers are exact.
     """
-    cost_end = _costs(tile_begin, pair_tile)
+    cost_end = sum_costs(tile_begin, pair_tile)
     for part in prange(_PARTS):
-        first, last = _share(cost_end, part), _share(cost_end, part + 1)
+        first, last = share(cost_end, part), share(cost_end, part + 1)
         _multiply_paired_run(tile_begin, index, scale, value, coefficients, pair_tile, pair_version, first, last, out)

@@ -327,6 +327,51 @@ def widen(builder: Any, values: Any) -> Any:
     return builder.sext(_load(builder, values[0], ir.VectorType(_I8, 32)), _W32X)
 
 
+@_operation(words, types.int64, types.int64)
+def widen_two(builder: Any, values: Any) -> Any:
+    """Pairs of one int8 of 16 at an address and one of 16 at another."""
+    low, high = (builder.sext(_load(builder, value, ir.VectorType(_I8, 16)), _I16X) for value in values)
+    low = builder.and_(low, ir.Constant(_I16X, [0xFFFF] * 16))
+    high = builder.shl(high, ir.Constant(_I16X, [16] * 16))
+    return builder.bitcast(builder.or_(low, high), _W32X)
+
+
+@_operation(types.int64, types.int64, types.int64, types.int64, types.float32, types.int64, types.int64)
+def store_large(builder: Any, values: Any) -> Any:
+    """Numbers of those of 16 terms that are `least` or more, one after the other to an address; how many they are.
+
+    Terms are ``size[index] * scale``: addresses of 16 int32 indices, of 16
+    float32 scales and of the sizes, `least`, the number of the first term, and the address for int32 numbers.
+    """
+    index, scale, size, least, first, place = values
+    i64, flags = ir.IntType(64), ir.VectorType(ir.IntType(1), 16)
+    offset = builder.shl(builder.sext(_load(builder, index, _I16X), ir.VectorType(i64, 16)), _all(i64, 2))
+    address = builder.add(offset, _spread(builder, size, ir.VectorType(i64, 16)))
+    pointers = builder.inttoptr(address, ir.VectorType(_F32.as_pointer(), 16))
+    gather = cgutils.get_or_insert_function(
+        builder.module,
+        ir.FunctionType(_F16X, [pointers.type, _I32, flags, _F16X]),
+        "llvm.masked.gather.v16f32.v16p0f32",
+    )
+    every = ir.Constant(flags, [1] * 16)
+    found = builder.call(gather, [pointers, ir.Constant(_I32, 4), every, ir.Constant(_F16X, [0.0] * 16)])
+    term = builder.fmul(found, _load(builder, scale, _F16X))
+    large = builder.fcmp_ordered(">=", term, _spread(builder, least, _F16X))
+    number = builder.add(_spread(builder, builder.trunc(first, _I32), _I16X), ir.Constant(_I16X, list(range(16))))
+    keep = cgutils.get_or_insert_function(
+        builder.module,
+        ir.FunctionType(ir.VoidType(), [_I16X, _I32.as_pointer(), flags]),
+        "llvm.masked.compressstore.v16i32",
+    )
+    builder.call(keep, [number, builder.inttoptr(place, _I32.as_pointer()), large])
+    bits = builder.bitcast(large, _I16)
+    return builder.zext(builder.ctpop(bits), i64)
+
+
+def _all(kind: Any, number: int) -> Any:
+    return ir.Constant(ir.VectorType(kind, 16), [number] * 16)
+
+
 @_operation(words, types.int64)
 def spread_pair(builder: Any, values: Any) -> Any:
     """The two int16 at an address, 16 times."""

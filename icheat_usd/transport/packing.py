@@ -40,7 +40,7 @@ class _Weighted(NamedTuple):
 class _Tile(NamedTuple):
     """A packed tile."""
 
-    index: I32
+    coefficient: I32
     scale: F32
     value: NDArray[np.int8]
 
@@ -81,7 +81,8 @@ class _Packer:
             if n_kept.max() <= self._index.shape[1]:
                 break
             self._make_room(min(self.tree.n_leaves, 5 * int(n_kept.max()) // 4))
-        return [_Tile(*(column[i, :n].copy() for column in self._packed)) for i, n in enumerate(count)]
+        index, scale, value = self._packed
+        return [_Tile(index[i, :n].copy(), scale[i, :n].copy(), value[i, :n].copy()) for i, n in enumerate(count)]
 
 
 def pack(
@@ -357,5 +358,6 @@ def _join(tree: ClusterTree, n_rows: int, tiles: list[_Tile]) -> PackedRows:
         tiles = [_Tile(np.empty(0, np.int32), np.empty(0, np.float32), np.empty((0, LANES), np.int8))] * (
             -(-n_rows // LANES)
         )
-    begin = _begin(np.array([len(tile.index) for tile in tiles], np.int64))
-    return PackedRows(tree, n_rows, begin, *(np.concatenate(column) for column in zip(*tiles, strict=True)))
+    begin = _begin(np.array([len(tile.coefficient) for tile in tiles], np.int64))
+    index, scale, value = (np.concatenate([tile[k] for tile in tiles]) for k in range(3))
+    return PackedRows(tree, n_rows, begin, index, scale, value)

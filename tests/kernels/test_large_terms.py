@@ -1,0 +1,76 @@
+"""Products without the terms that are small in a light, against products with all."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from icheat_usd.kernels.large_terms import multiply_large_terms
+from icheat_usd.kernels.packed import multiply_tiles
+
+N_COEFFICIENTS = 300
+
+
+def some_tiles() -> tuple[np.ndarray, ...]:
+    """Four tiles: with many coefficients, an odd number of them, one, and none."""
+    rng = np.random.default_rng(3)
+    counts = [130, 37, 1, 0]
+    begin = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    index = np.concatenate([np.sort(rng.choice(N_COEFFICIENTS, n, replace=False)) for n in counts]).astype(np.int32)
+    scale = (rng.random(begin[-1]) ** 6).astype(np.float32)
+    value = rng.integers(-127, 128, (begin[-1], 64)).astype(np.int8)
+    return begin, index, scale, value
+
+
+def some_light() -> np.ndarray:
+    light = np.zeros((2, N_COEFFICIENTS, 4), np.float32)
+    light[..., :3] = np.random.default_rng(4).normal(size=(2, N_COEFFICIENTS, 3))
+    return light
+
+
+PAIR_TILE, PAIR_VERSION = np.array([0, 0, 1, 2, 3, 1], np.int32), np.array([0, 1, 1, 0, 0, 0], np.int32)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.01, 0.3, 1e6])
+def test_the_product_is_that_of_the_large_terms(least: float) -> None:
+    begin, index, scale, value = some_tiles()
+    light = some_light()
+    size = np.abs(light).max(axis=2)
+    expected, found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
+    multiply_large_terms(
+        begin, index, scale, value, light, size, np.full(2, least, np.float32), PAIR_TILE, PAIR_VERSION, found
+    )
+    for p, (tile, version) in enumerate(zip(PAIR_TILE, PAIR_VERSION, strict=True)):
+        entries = slice(begin[tile], begin[tile + 1])
+        large = size[version, index[entries]] * scale[entries] >= np.float32(least)
+        some = np.array([0, large.sum()], np.int64)
+        one = np.zeros(1, np.int32)
+        multiply_tiles(
+            some,
+            index[entries][large],
+            scale[entries][large],
+            value[entries][large],
+            light[version : version + 1],
+            one,
+            one,
+            expected[p : p + 1],
+        )
+    assert expected.any() == (least < 1e6)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * max(np.abs(expected).max(), 1e-6))
+    if 0 < least < 1e6:
+        whole = np.zeros_like(expected)
+        multiply_tiles(begin, index, scale, value, light, PAIR_TILE, PAIR_VERSION, whole)
+        assert np.abs(whole - expected).max() > 0
+
+
+def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
+    begin, index, scale, value = some_tiles()
+    light = some_light()
+    size, least = np.abs(light).max(axis=2), np.full(2, 0.01, np.float32)
+    found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
+    for threads, out in zip((1, 2), found, strict=True):
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        multiply_large_terms(begin, index, scale, value, light, size, least, PAIR_TILE, PAIR_VERSION, out)
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert np.array_equal(found[0], found[1])
