@@ -168,11 +168,12 @@ def interpolation_weights(  # type: ignore[no-untyped-def]
     row_of_view,
     bucket_begin,
     bucket_row,
+    wanted,
     count,
     out_row,
     out_weight,
 ):
-    """Up to four rows and their weights for every view sample; count 0 where no row is near enough.
+    """Up to four rows and their weights for the view samples that are wanted; count 0 where no row is near enough.
 
     Squared distance between points: (distance / spacing)^2 + 2 (1 - cos of the
     normals), candidates from the blocks around the sample's own. Weights after
@@ -180,6 +181,9 @@ def interpolation_weights(  # type: ignore[no-untyped-def]
     goes at once.
     """
     for v in prange(len(count)):
+        count[v] = 0
+        if not wanted[v]:
+            continue
         if row_of_view[v] >= 0:
             count[v] = 1
             out_row[v, 0] = row_of_view[v]
@@ -219,7 +223,6 @@ def interpolation_weights(  # type: ignore[no-untyped-def]
                             k -= 1
                         near[k] = d
                         best[k] = row
-        count[v] = 0
         if near[0] > _ACCEPT:
             continue
         limit = min(near[_NEIGHBOURS], _REACH)

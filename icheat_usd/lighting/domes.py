@@ -10,6 +10,7 @@ from icheat_usd.kernels import domes as kernels
 from icheat_usd.kernels.direct import fill_analytic
 from icheat_usd.kernels.environment import dome_radiance
 from icheat_usd.lighting.change import append_texture, new_light, texture_image
+from icheat_usd.lighting.guide import Effort
 from icheat_usd.lighting.quick import Shadows
 from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
 from icheat_usd.materials import evaluate_specular, is_glossy, take_points
@@ -38,11 +39,11 @@ class SeenSky:
 
 
 def white_sky(
-    snapshot: SceneSnapshot, tracer: Tracer, points: SurfacePoints, seed: int
+    snapshot: SceneSnapshot, tracer: Tracer, points: SurfacePoints, seed: int, effort: Effort | None = None
 ) -> tuple[SceneSnapshot, LightSampler]:
     """The scene under an even sky, and a sampler that has learnt from where around some points it is seen."""
     even = new_light(snapshot, "", LightKind.DOME, to_world=np.eye(3, 4), radiance=(1, 1, 1))
-    return even, build_light_sampler(even, tracer, points, seed)
+    return even, build_light_sampler(even, tracer, points, seed, effort)
 
 
 def see_sky(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,10 +25,18 @@ from icheat_usd.tracing import Tracer, spawn_points, transmittance
 _CELLS = BANDS * COLUMNS
 
 _POINTS = 1 << 15  # that vote for the leaves: more only make the tree slower to build
-_LEAVES = 512  # places that are told apart; with normals about three times as many densities
 _GROUPS_AT_ONCE = 128  # densities learnt together: a quarter of a million rays
 
-_RAYS = 3  # per cell of a plane, from as many points of the place
+
+class Effort(NamedTuple):
+    """How much is learnt."""
+
+    leaves: int = 512  #: places that are told apart; with normals about three times as many densities
+    rays: int = 3  #: per cell of a plane, from as many points of the place
+
+
+#: For a first look: a thirtieth of the rays.
+LITTLE = Effort(48, 1)
 
 # Share of a guided image dome's samples that stays proportional to the image: what the few pilot rays
 # of a cell missed is still found.
@@ -53,7 +63,12 @@ def no_guide(n_lights: int) -> Guide:
 
 
 def learn_guide(
-    snapshot: SceneSnapshot, tracer: Tracer, tables: LightTables, points: SurfacePoints, seed: int
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    tables: LightTables,
+    points: SurfacePoints,
+    seed: int,
+    effort: Effort = Effort(),  # noqa: B008 (a constant)
 ) -> Guide:
     """Measure with pilot rays which cells of each dome's plane light the places around some points.
 
@@ -77,7 +92,7 @@ def learn_guide(
     if not len(domes) or not len(real):
         return no_guide(len(lights.kind))
     points = take_points(points, real)
-    axis, split, child, n_leaves = _tree(points.position)
+    axis, split, child, n_leaves = _tree(points.position, effort.leaves)
     key = np.empty(len(real), np.int64)
     find_keys(axis, split, child, points.position, points.shading_normal, key)
     points = take_points(points, np.argsort(key, kind="stable"))
@@ -89,8 +104,8 @@ def learn_guide(
     n_rows = 0
     for light in domes.tolist():
         square = np.zeros((len(keys), _CELLS), np.float32)
-        for turn in range(_RAYS):
-            square += _pilot(snapshot, tracer, tables, light, points, begin, seed + turn) / np.float32(_RAYS)
+        for turn in range(effort.rays):
+            square += _pilot(snapshot, tracer, tables, light, points, begin, seed + turn) / np.float32(effort.rays)
         weight, useful = _weights(square, keys, textured=bool(lights.texture[light] >= 0))
         rows[light, keys[useful]] = n_rows + np.arange(len(useful), dtype=np.int32)
         weights.append(weight[useful])
@@ -101,9 +116,9 @@ def learn_guide(
     return Guide(axis, split, child, rows, bands, columns)
 
 
-def _tree(position: F32) -> tuple[I32, F32, I32, int]:
+def _tree(position: F32, leaves: int) -> tuple[I32, F32, I32, int]:
     """Split points at the median of their longest side until a leaf holds few; nodes and number of leaves."""
-    smallest = max(16, len(position) // _LEAVES)
+    smallest = max(16, len(position) // leaves)
     axis, split, child = [-1], [0.0], [0]
     pending: list[tuple[int, NDArray[np.int64]]] = [(0, np.arange(len(position)))]
     n_leaves = 0

@@ -9,7 +9,7 @@ import numpy as np
 from icheat_usd.kernels.environment import dome_columns_cdf
 from icheat_usd.kernels.guide import Guide
 from icheat_usd.kernels.lights import LightTables
-from icheat_usd.lighting.guide import learn_guide, no_guide
+from icheat_usd.lighting.guide import Effort, learn_guide, no_guide
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, SurfacePoints, Texture
 from icheat_usd.tracing import Tracer
@@ -47,7 +47,11 @@ class LightSampler:
 
 
 def build_light_sampler(
-    snapshot: SceneSnapshot, tracer: Tracer | None = None, points: SurfacePoints | None = None, seed: int = 0
+    snapshot: SceneSnapshot,
+    tracer: Tracer | None = None,
+    points: SurfacePoints | None = None,
+    seed: int = 0,
+    effort: Effort | None = None,
 ) -> LightSampler:
     """Prepare the sampling of every light.
 
@@ -62,6 +66,8 @@ def build_light_sampler(
         most of the noise in rooms with windows. Light elsewhere is as right, only noisier.
     seed : int
         Of the rays that learn; what is learnt depends on nothing else.
+    effort : Effort, optional
+        How much is learnt.
     """
     lights = snapshot.lights
     n = len(lights.kind)
@@ -88,7 +94,7 @@ def build_light_sampler(
     )
     guide = no_guide(n)
     if tracer is not None and points is not None:
-        guide = learn_guide(snapshot, tracer, tables, points, seed)
+        guide = learn_guide(snapshot, tracer, tables, points, seed, effort or Effort())
     return LightSampler(
         tables=tables,
         guide=guide,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,16 +11,18 @@ from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.rows import mean_over_segments
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct, samples_per_light
 from icheat_usd.lighting.domes import BinnedSky, SeenSky, see_sky, white_sky
+from icheat_usd.lighting.guide import LITTLE
 from icheat_usd.lighting.points import has_points
 from icheat_usd.lighting.quick import Places, Shadows, build_shadows, direct_at, prepare_places
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot
+from icheat_usd.scene import F32, I32, I64, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.transport import Bounces, solve_bounces
 from icheat_usd.transport.quick_bounces import QuickBounces, build_quick_bounces
+from icheat_usd.transport.sparse import SparseRows
 
 # Smoother lobes are found by rays of their own at rest: points of the light miss them.
 _SMOOTH = 0.3
@@ -28,6 +31,16 @@ _RAYS_PER_STEP = 1 << 16  # of the general way
 
 # Rays to the sky of each patch point and view sample, for domes on the move.
 _SKY_OF_CELLS, _SKY_OF_VIEW = 2, 8
+
+# The same of each sample of a `SparseView`.
+_SKY_OF_FEW = 16
+
+
+class SparseView(NamedTuple):
+    """View samples from which the sky is looked at, where all would take too long; the others follow from them."""
+
+    samples: I32  #: (n,)
+    interpolation: SparseRows  #: (n_view x n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +62,7 @@ class Surroundings:
     smooth: I64  #: view samples with narrow lobes
 
     seed: int
+    sparse: SparseView | None = None
     _sky: list[SeenSky] = field(default_factory=list)  #: of cells and view, once a dome asks for them
 
     def sky(self) -> list[SeenSky]:
@@ -56,23 +70,41 @@ class Surroundings:
         if not self._sky:
             assert self.shadows is not None
             gather, view = self.gather, self.view
-            even, sampler = white_sky(self.snapshot, self.tracer, gather.patch_points, self.seed)
+            effort = None if self.sparse is None else LITTLE
+            even, sampler = white_sky(self.snapshot, self.tracer, gather.patch_points, self.seed, effort)
             ways = (even, sampler, self.shadows)
             tint = self.cell_means(self.patch_tint)
             view_tint = view.points.albedo / np.float32(np.pi)
             self._sky.append(
                 see_sky(*ways, gather.patch_points, tint, None, _SKY_OF_CELLS, self.seed, gather.cell_begin)
             )
-            self._sky.append(see_sky(*ways, view.points, view_tint, view.to_eye, _SKY_OF_VIEW, self.seed + 1))
+            if self.sparse is None:
+                self._sky.append(see_sky(*ways, view.points, view_tint, view.to_eye, _SKY_OF_VIEW, self.seed + 1))
+            else:
+                few = take_points(view.points, self.sparse.samples.astype(np.int64))
+                white = np.full((len(few.instance), 3), 1.0 / np.pi, np.float32)
+                self._sky.append(see_sky(*ways, few, white, None, _SKY_OF_FEW, self.seed + 1))
         return self._sky
+
+    def light_view(self, sky: F32, out: F32) -> None:
+        """What the view samples reflect of a binned sky; diffusely, if it is looked at from few of them."""
+        of_view = self.sky()[1]
+        if self.sparse is None:
+            of_view.light(sky, out)
+            return
+        few = np.empty((len(self.sparse.samples), 3), np.float32)
+        of_view.light(sky, few)
+        np.multiply(self.sparse.interpolation.matmul(few), self.view.points.albedo, out=out)
 
     def can_move(self, alone: SceneSnapshot) -> bool:
         """Whether the light of a one-light snapshot has the quick way."""
         return self.shadows is not None and has_points(int(alone.lights.kind[0]))
 
-    def all_bounces(self, direct: F32) -> F32:
-        """Light that leaves the cells, quickly."""
-        return direct if self.quick_bounces is None else self.quick_bounces.solve(direct)
+    def all_bounces(self, direct: F32, before: tuple[F32, F32] | None = None) -> F32:
+        """Light that leaves the cells, quickly; the closer to direct light and radiance `before`, the better."""
+        if self.quick_bounces is None:
+            return direct
+        return self.quick_bounces.solve(direct) if before is None else self.quick_bounces.follow(*before, direct)
 
     def cell_means(self, of_patches: F32) -> F32:
         """Means over the patch points of each cell."""
@@ -89,6 +121,7 @@ def build_surroundings(
     bounces: Bounces,
     n_bounces: int,
     seed: int,
+    sparse: SparseView | None = None,
 ) -> Surroundings:
     """Prepare the places where lights shine."""
     albedo = effective_albedo(gather.patch_points)
@@ -115,6 +148,7 @@ def build_surroundings(
         tiles,
         np.flatnonzero(is_glossy(view.points) & (view.points.roughness < _SMOOTH)),
         seed,
+        sparse,
     )
 
 
@@ -135,6 +169,7 @@ class MovingLight:
     ) -> None:
         self._around, self._alone, self._seed, self._rounds = around, alone, seed, light_samples
         self._step = 0
+        self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self._cells = np.zeros((around.gather.n, 3), np.float32)
         self._view = np.zeros((around.view.n, 3), np.float32)
 
@@ -144,7 +179,8 @@ class MovingLight:
         assert around.shadows is not None and around.cells is not None and around.tiles is not None
         direct = np.empty((around.gather.n, 3), np.float32)
         direct_at(self._alone, around.shadows, around.cells, self._seed, False, direct)
-        radiance[:] = around.all_bounces(direct)
+        radiance[:] = around.all_bounces(direct, None if self.direct is None else (radiance, self.direct))
+        self.direct = direct
         direct_at(self._alone, around.shadows, around.tiles, self._seed, True, view_direct)
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
@@ -154,7 +190,8 @@ class MovingLight:
         turn, at_view = divmod(self._step, 2)
         self._step += 1
         if turn == self._rounds:
-            radiance[:] = solve_bounces(around.bounces, (self._cells / np.float32(turn))[None], around.n_bounces)[0]
+            self.direct = self._cells / np.float32(turn)
+            radiance[:] = solve_bounces(around.bounces, self.direct[None], around.n_bounces)[0]
             self._find_highlights(view_direct)
             return False
         places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
@@ -165,7 +202,9 @@ class MovingLight:
         if at_view:
             np.multiply(into, share, out=view_direct)
         else:
-            radiance[:] = around.all_bounces(into * share)
+            direct = into * share
+            radiance[:] = around.all_bounces(direct, None if self.direct is None else (radiance, self.direct))
+            self.direct = direct
         return True
 
     def _find_highlights(self, view_direct: F32) -> None:
@@ -190,6 +229,7 @@ class AnyLight:
         self._samplers: list[LightSampler] = []
         self._cell = self._sample = 0
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
+        self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self._cells = np.zeros((around.gather.n, 3), np.float32)
         self._view = np.zeros((around.view.n, 3), np.float32)
 
@@ -197,18 +237,20 @@ class AnyLight:
         """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample."""
         around = self._around
         if around.shadows is not None and self._alone.lights.kind[0] == LightKind.DOME:
-            of_cells, of_view = around.sky()
+            of_cells = around.sky()[0]
             self.bins = self.bins or BinnedSky(self._alone)
             sky = self.bins.under(self._alone)
             direct = np.empty((around.gather.n, 3), np.float32)
             of_cells.light(sky, direct)
-            radiance[:] = around.all_bounces(direct)
-            of_view.light(sky, view_direct)
+            radiance[:] = around.all_bounces(direct, None if self.direct is None else (radiance, self.direct))
+            self.direct = direct
+            around.light_view(sky, view_direct)
             return
         patch = around.gather.cell_begin[:-1]
         points = take_points(around.gather.patch_points, patch)
         arriving = irradiance(self._alone, around.tracer, self._sampler(0), points, self._seed, 1)[0]
-        radiance[:] = around.all_bounces(arriving * around.patch_tint[patch])
+        self.direct = arriving * around.patch_tint[patch]
+        radiance[:] = around.all_bounces(self.direct)
         view_direct[:] = reflected_direct(
             self._alone, around.tracer, self._sampler(1), around.view.points, around.view.to_eye, self._seed, 1
         )[0]
@@ -219,6 +261,7 @@ class AnyLight:
         if self._cell < around.gather.n:
             self._light_cells()
             if self._cell == around.gather.n:
+                self.direct = self._cells
                 radiance[:] = solve_bounces(around.bounces, self._cells[None], around.n_bounces)[0]
             return True
         if self._sample < around.view.n:

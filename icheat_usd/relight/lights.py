@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from icheat_usd.lighting.change import LightError, changed_light, join_lights, new_light, one_light
 from icheat_usd.lighting.domes import BinnedSky
-from icheat_usd.relight.light_work import AnyLight, MovingLight, Surroundings, build_surroundings
+from icheat_usd.relight.light_work import AnyLight, MovingLight, SparseView, Surroundings, build_surroundings
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -24,6 +24,7 @@ class _Light:
     alone: SceneSnapshot
     work: AnyLight | MovingLight | None = None
     bins: BinnedSky | None = None  #: of a dome's image
+    direct: F32 | None = None  #: at the cells, of which the present radiance came
 
 
 class LiveLights:
@@ -39,6 +40,8 @@ class LiveLights:
         Diffuse reflections before the last one, as `solve_bounces`.
     light_samples, dome_samples : int
         Shadow rays per light and point at rest; domes get four times as many by default.
+    sparse : SparseView, optional
+        For a first look: domes light these view samples, diffusely, and the others follow from them.
     """
 
     def __init__(
@@ -53,13 +56,17 @@ class LiveLights:
         light_samples: int = 16,
         dome_samples: int | None = None,
         seed: int = 0,
+        sparse: SparseView | None = None,
     ) -> None:
         self._scene, self._seed = snapshot, seed
         self._light_samples, self._dome_samples = light_samples, dome_samples
-        self._around: Surroundings = build_surroundings(snapshot, tracer, view, gather, bounces, n_bounces, seed)
+        self._around: Surroundings = build_surroundings(
+            snapshot, tracer, view, gather, bounces, n_bounces, seed, sparse
+        )
         self._lights = [_Light(one_light(snapshot, light)) for light in range(len(snapshot.lights.kind))]
         n = len(self._lights)
         self.revision = 0  #: grows with everything that changes the light
+        self.moves = 0  #: grows with everything that does but gains
         self.gains: F32 = np.ones((n, 3), np.float32)  #: (n_lights, 3)
         self.radiance: F32 = np.zeros((n, gather.n, 3), np.float32)  #: (n_lights, n_gather, 3) at gain 1
         self.view_direct: F32 = np.zeros((n, view.n, 3), np.float32)  #: (n_lights, n_view, 3) at gain 1
@@ -141,6 +148,7 @@ class LiveLights:
         """Take a light away; those behind it move up by one."""
         self._checked(light)
         self.revision += 1
+        self.moves += 1
         del self._lights[light]
         self.gains = np.delete(self.gains, light, axis=0)
         self.radiance = np.delete(self.radiance, light, axis=0)
@@ -150,9 +158,12 @@ class LiveLights:
         """One step, some tens of milliseconds, towards the final quality of a light; False when nothing is left."""
         for light, state in enumerate(self._lights):
             if state.work is not None:
-                if not state.work.step(self.radiance[light], self.view_direct[light]):
+                more = state.work.step(self.radiance[light], self.view_direct[light])
+                state.direct = state.work.direct
+                if not more:
                     state.work = None
                 self.revision += 1
+                self.moves += 1
                 break
         return any(state.work is not None for state in self._lights)
 
@@ -174,7 +185,9 @@ class LiveLights:
         work = kind(self._around, state.alone, seed, *counts)
         if isinstance(work, AnyLight):
             work.bins = state.bins
+        work.direct = state.direct
         work.show(self.radiance[light], self.view_direct[light])
-        state.work = work
+        state.work, state.direct = work, work.direct
         state.bins = work.bins if isinstance(work, AnyLight) else None
         self.revision += 1
+        self.moves += 1

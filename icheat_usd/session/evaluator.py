@@ -9,6 +9,7 @@ import numpy as np
 from icheat_usd.edits.model import Edit, EditStack
 from icheat_usd.errors import EditError
 from icheat_usd.relight import RelitView
+from icheat_usd.relight.light_work import SparseView
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.samples import ViewSamples
@@ -27,10 +28,18 @@ class Evaluator:
     """The live relighter and the live lights of one view, brought to a state by what differs from the last one.
 
     Not for two threads at once. The same state has the same image, whatever came before.
+
+    Parameters
+    ----------
+    is_coarse : bool
+        For a first look: domes are worked out where the transport has rows alone.
     """
 
-    def __init__(self, parts: ShotParts, transport: Transport | PackedTransport) -> None:
+    def __init__(self, parts: ShotParts, transport: Transport | PackedTransport, *, is_coarse: bool = False) -> None:
         quality = parts.quality
+        sparse = None
+        if is_coarse and isinstance(transport, Transport) and transport.interpolation is not None:
+            sparse = SparseView(transport.row_view, transport.interpolation)
         self._snapshot = parts.snapshot
         self.lights = LiveLights(
             parts.snapshot,
@@ -42,6 +51,7 @@ class Evaluator:
             light_samples=quality.light_samples,
             dome_samples=quality.dome_samples,
             seed=quality.seed,
+            sparse=sparse,
         )
         rows = transport if isinstance(transport, Transport) else transport.source
         held_back = None

@@ -253,7 +253,7 @@ class LiveFrames:
         if evaluator is None:
             for transport in parts.transports():
                 if evaluator is None:
-                    evaluator = self._evaluator(parts, transport)
+                    evaluator = self._evaluator(parts, transport, level)
                     self._show(
                         number,
                         frame,
@@ -270,11 +270,11 @@ class LiveFrames:
         self._show(number, frame, evaluator, level, began)
         self._building.pop((number, level), None)
 
-    def _evaluator(self, parts: ShotParts, transport: Transport | PackedTransport) -> Evaluator:
+    def _evaluator(self, parts: ShotParts, transport: Transport | PackedTransport, level: Level) -> Evaluator:
         """At the state already: without the lock, as lights that were changed are worked out here."""
         with self._background.lock:
             state = self.state
-        evaluator = Evaluator(parts, transport)
+        evaluator = Evaluator(parts, transport, is_coarse=level is Level.PREVIEW)
         evaluator.show(self._read_stack(parts.snapshot), state)
         return evaluator
 

@@ -7,7 +7,7 @@ import numpy as np
 from icheat_usd.kernels import transport as kernels
 from icheat_usd.kernels.rows import pack_rows
 from icheat_usd.samples import ViewSamples
-from icheat_usd.scene import F32, I32, I64, Camera
+from icheat_usd.scene import F32, I32, I64, Bool, Camera
 from icheat_usd.transport.sparse import SparseRows
 
 _LEAST_COSINE = 0.2  # at grazing angles neighbouring pixels lie this much further apart, and no more
@@ -53,9 +53,12 @@ def sparse_rows_of_view(view: ViewSamples, camera: Camera, spacing: int) -> tupl
         on_grid = (x % step == step // 2) & (y % step == step // 2)
         has_row |= missing & on_grid
         row_view = np.flatnonzero(has_row)
-        rows = _weights(view, block, n_blocks_x, n_blocks_y, extent, row_view)
-        missing = np.diff(rows.indptr) == 0
+        # What has a row near keeps one: more rows change its weights, and these are needed at the end alone.
+        rows = _weights(view, block, n_blocks_x, n_blocks_y, extent, row_view, missing)
+        missing &= np.diff(rows.indptr) == 0
         if not missing.any():
+            everywhere = np.ones(view.n, bool)
+            rows = _weights(view, block, n_blocks_x, n_blocks_y, extent, row_view, everywhere)
             return row_view.astype(np.int32), rows
         step = max(1, step // 2)
 
@@ -70,7 +73,10 @@ def _pixel_extent(view: ViewSamples, camera: Camera) -> F32:
     return np.maximum(extent / np.maximum(cosine, np.float32(_LEAST_COSINE)), np.float32(1e-20))
 
 
-def _weights(view: ViewSamples, block: I32, n_blocks_x: int, n_blocks_y: int, extent: F32, row_view: I64) -> SparseRows:
+def _weights(
+    view: ViewSamples, block: I32, n_blocks_x: int, n_blocks_y: int, extent: F32, row_view: I64, wanted: Bool
+) -> SparseRows:
+    """Weights of some view samples; the others have none."""
     n_rows = len(row_view)
     row_of_view = np.full(view.n, -1, np.int64)
     row_of_view[row_view] = np.arange(n_rows)
@@ -92,6 +98,7 @@ def _weights(view: ViewSamples, block: I32, n_blocks_x: int, n_blocks_y: int, ex
         row_of_view,
         bucket_begin,
         bucket_row,
+        wanted,
         count,
         near,
         weight,
