@@ -26,21 +26,22 @@ def shorten(indices: np.ndarray, weights: np.ndarray, column_bits: int, out: np.
 
 
 @parallel_kernel
-def first_bounce(
+def find_residual(
     indptr: np.ndarray,
     entries: np.ndarray,
     column_bits: int,
     direct: np.ndarray,
+    light: np.ndarray,
     albedo: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """``out = direct + albedo * (rows @ direct)``; `entries` are those of `shorten`.
+    """``out = direct - light + albedo * (rows @ light)``; `entries` are those of `shorten`.
 
-    `direct` and `out` have a fourth column, 0 in `direct`.
+    `light` and `out` have a fourth column, 0 in `light`.
     """
     mask = np.uint32((1 << column_bits) - 1)
     weights = entries.view(np.float32)
-    start, target = address_of(direct), address_of(out)
+    start, target = address_of(light), address_of(out)
     for block in prange((len(albedo) + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(len(albedo), (block + 1) * BLOCK)):
             # four sums, so that an addition need not wait for the one before
@@ -58,32 +59,34 @@ def first_bounce(
             one = np.float32(1.0)
             store_color(target + i * 16, scale_add(scale_add(s0, one, s1), one, scale_add(s2, one, s3)))
             for c in range(3):
-                out[i, c] = direct[i, c] + albedo[i, c] * out[i, c]
+                out[i, c] = direct[i, c] - light[i, c] + albedo[i, c] * out[i, c]
 
 
 @parallel_kernel
-def cluster_means(begin: np.ndarray, weight: np.ndarray, total: np.ndarray, minus: np.ndarray, out: np.ndarray) -> None:
-    """Weighted mean over each cluster of ``total - minus``, (3, n_clusters); weights of a cluster sum to 1."""
+def cluster_means(begin: np.ndarray, weight: np.ndarray, light: np.ndarray, out: np.ndarray) -> None:
+    """Weighted mean over each cluster, (3, n_clusters); weights of a cluster sum to 1."""
     for c in prange(len(begin) - 1):
         r = np.float32(0.0)
         g = np.float32(0.0)
         b = np.float32(0.0)
         for i in range(begin[c], begin[c + 1]):
-            r += weight[i] * (total[i, 0] - minus[i, 0])
-            g += weight[i] * (total[i, 1] - minus[i, 1])
-            b += weight[i] * (total[i, 2] - minus[i, 2])
+            r += weight[i] * light[i, 0]
+            g += weight[i] * light[i, 1]
+            b += weight[i] * light[i, 2]
         out[0, c] = r
         out[1, c] = g
         out[2, c] = b
 
 
 @parallel_kernel
-def add_clusters(begin: np.ndarray, albedo: np.ndarray, arriving: np.ndarray, out: np.ndarray) -> None:
-    """Add what each cell of a cluster reflects of the light that arrives at the cluster."""
+def add_clusters(
+    begin: np.ndarray, albedo: np.ndarray, light: np.ndarray, arriving: np.ndarray, out: np.ndarray
+) -> None:
+    """Add to `out` the `light` of each cell, and what it reflects of the light that arrives at its cluster."""
     for c in prange(len(begin) - 1):
         for i in range(begin[c], begin[c + 1]):
             for k in range(3):
-                out[i, k] += albedo[i, k] * arriving[c, k]
+                out[i, k] += light[i, k] + albedo[i, k] * arriving[c, k]
 
 
 @parallel_kernel

@@ -54,6 +54,22 @@ def test_more_clusters_come_closer_to_the_light_of_the_view(room: Pipeline) -> N
     assert more < 0.6 * few < 0.3 * two_reflections
 
 
+def test_light_that_follows_a_change_converges_on_the_exact_bounces(room: Pipeline) -> None:
+    """Every step takes most of the error away, and a small change starts with a small one."""
+    direct = room.cell_light.direct[0]
+    before = direct * np.random.default_rng(0).uniform(0.8, 1.2, direct.shape).astype(np.float32)
+    exact, exact_before = (solve_bounces(room.bounces, light[None], 40)[0] for light in (direct, before))
+    quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=64)
+
+    def error(radiance: np.ndarray) -> float:
+        return float(np.sqrt(((radiance - exact) ** 2).sum() / (exact**2).sum()))
+
+    followed = quick.follow(exact_before, before, direct)
+    assert error(followed) < 0.02 < 0.1 * error(exact_before) + 0.02
+    assert error(quick.follow(followed, direct, direct)) < 0.5 * error(followed)
+    assert error(followed) < error(quick.solve(direct)) < 0.03
+
+
 def test_clusters_are_subtrees_that_cover_all_cells(room: Pipeline) -> None:
     begin = cluster_begins(room.gather.tree, 20)
     assert begin[0] == 0 and begin[-1] == room.gather.n
