@@ -11,10 +11,11 @@ from icheat_usd.transport.bounces import (
 )
 from icheat_usd.transport.build import Lobe, Transport, build_transport
 from icheat_usd.transport.held_back import HeldBack
-from icheat_usd.transport.packed import PackedLobe, PackedRows, PackedTransport, PackingReport
-from icheat_usd.transport.packing import lossless, pack, residual
+from icheat_usd.transport.packed import LargeTerms, PackedLobe, PackedRows, PackedTransport, PackingReport
+from icheat_usd.transport.packing import lossless, pack
 from icheat_usd.transport.progressive import build_transports
 from icheat_usd.transport.records import RecordSettings
+from icheat_usd.transport.residual import residual, residual_in_steps
 from icheat_usd.transport.sparse import SparseRows
 from icheat_usd.transport.training import training_radiance
 
@@ -22,6 +23,7 @@ __all__ = [
     "Bounces",
     "CellLight",
     "HeldBack",
+    "LargeTerms",
     "Lobe",
     "PackedLobe",
     "PackedRows",
@@ -37,6 +39,7 @@ __all__ = [
     "lossless",
     "pack",
     "residual",
+    "residual_in_steps",
     "solve_bounces",
     "sum_groups",
     "sum_lights",

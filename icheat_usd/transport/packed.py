@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from icheat_usd.kernels import packing as kernels
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_forward
-from icheat_usd.scene import F32, F64, I32, I64, Bool
+from icheat_usd.scene import F32, F64, I32, I64
 from icheat_usd.transport.build import Transport
 from icheat_usd.transport.sparse import SparseRows
 
 LANES = 64  #: rows of a tile
+_SAMPLED = 32_768  # terms that stand for all
+_BYTES_OF_TERM = LANES + 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +72,25 @@ class PackedRows:
         kernels.multiply_tiles(self.tile_begin, self.index, self.scale, self.value, coefficients, out)
         return out[: self.n_rows]
 
-    def keep(self, kept: Bool) -> PackedRows:
-        """Without the entries that are not marked in `kept` (n,)."""
-        count = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
-        return replace(
-            self,
-            tile_begin=count[self.tile_begin],
-            index=self.index[kept],
-            scale=self.scale[kept],
-            value=self.value[kept],
+    def of_large_terms(self, size: F32, least: float) -> PackedRows:
+        """With the entries alone whose terms ``scale * size (n_leaves,)`` are at least `least`, and the roots."""
+        count = np.empty(self.n_tiles, np.int64)
+        terms = self.index, self.scale
+        kernels.count_large(self.tile_begin, *terms, size, np.float32(least), count)
+        begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+        index, scale = np.empty(begin[-1], np.int32), np.empty(begin[-1], np.float32)
+        value = np.empty((begin[-1], LANES), self.value.dtype)
+        kernels.copy_large(
+            self.tile_begin, *terms, self.value, size, np.float32(least), begin[:-1], index, scale, value
         )
+        return replace(self, tile_begin=begin, index=index, scale=scale, value=value)
+
+    def tiles(self, first: int, last: int) -> PackedRows:
+        """Tiles ``first:last`` as rows of their own."""
+        begin = self.tile_begin[first : last + 1]
+        some = slice(begin[0], begin[-1])
+        n_rows = max(min(self.n_rows, last * LANES) - first * LANES, 0)
+        return PackedRows(self.tree, n_rows, begin - begin[0], self.index[some], self.scale[some], self.value[some])
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,33 +154,64 @@ class PackedTransport:
                 out += lobe.tint * (product if self.interpolation is None else self.interpolation.matmul(product))
         return out
 
-    def narrowed(self, coefficients: F32, max_bytes: int) -> PackedTransport:
-        """Only what adds most to products with some lights, for frames that keep to these lights.
+    def narrowed(self, size: F32, max_bytes: int) -> PackedTransport:
+        """The coefficients alone that add most to products with some light, for frames that keep to it.
+
+        `residual` of the result tells what is lost of a light.
 
         Parameters
         ----------
-        coefficients : (n_leaves,)
+        size : (n_leaves,) float32
             Largest size that each Haar coefficient of the light will have.
         max_bytes
-            Of the tiles together.
-
-        Notes
-        -----
-        Which coefficients matter to a light depends on the light: for one that
-        is known, an eighth of them serves as well as all. `residual` of the result
-        tells what is lost of a light.
+            Of the tiles together, about.
         """
-        worth = []
-        for lobe in self.lobes:
-            tint = np.sqrt(np.mean(np.square(lobe.tint), dtype=np.float64))
-            size = np.take(coefficients, lobe.rows.index) * lobe.rows.scale * np.float32(tint)
-            worth.append(np.where(lobe.rows.index == 0, np.float32(np.inf), size))
-        n_kept = max_bytes // (LANES + 8)
-        every = np.concatenate(worth)
-        if n_kept >= len(every):
+        if max_bytes >= self.n_bytes:
             return self
-        least = np.partition(every, len(every) - n_kept)[len(every) - n_kept] if n_kept > 0 else np.inf
+        size = np.ascontiguousarray(size, np.float32)
+        least = LargeTerms(self).least(size, max_bytes)
         lobes = [
-            replace(lobe, rows=lobe.rows.keep(size >= least)) for lobe, size in zip(self.lobes, worth, strict=True)
+            replace(lobe, rows=lobe.rows.of_large_terms(size, of_lobe))
+            for lobe, of_lobe in zip(self.lobes, least, strict=True)
         ]
         return replace(self, lobes=tuple(lobes))
+
+
+class LargeTerms:
+    """How large a term of a packed transport must be to be among the largest in a light.
+
+    A term is a coefficient of a tile times that of the light, as far as it goes
+    into pixels. Which are large depends on the light: for one that is known,
+    a quarter of the coefficients serves nearly as well as all.
+    """
+
+    def __init__(self, transport: PackedTransport, seed: int = 0) -> None:
+        lobes = transport.lobes
+        tint = [float(np.sqrt(np.mean(np.square(lobe.tint), dtype=np.float64))) for lobe in lobes]
+        self._tint = np.array(tint, np.float32)
+        begin = np.concatenate([[0], np.cumsum([len(lobe.rows.index) for lobe in lobes])])
+        self.n_terms = int(begin[-1])  #: of all lobes
+        sample = np.arange(self.n_terms)
+        if self.n_terms > _SAMPLED:
+            sample = np.sort(np.random.default_rng(seed).integers(self.n_terms, size=_SAMPLED))
+        parts = [
+            (lobe.rows, sample[(sample >= first) & (sample < last)] - first, of_lobe)
+            for lobe, first, last, of_lobe in zip(lobes, begin[:-1], begin[1:], self._tint, strict=True)
+        ]
+        self._index = np.concatenate([rows.index[some] for rows, some, _ in parts])
+        self._scale = np.concatenate([rows.scale[some] * of_lobe for rows, some, of_lobe in parts])
+
+    def least(self, size: F32, max_bytes: int) -> F32:
+        """Least size of ``scale * size`` in each lobe, so that larger terms take about `max_bytes`: (n_lobes,).
+
+        Parameters
+        ----------
+        size : (n_leaves,) float32
+            Largest size of each Haar coefficient of the light.
+        """
+        n_kept = round(len(self._index) * max_bytes / (max(self.n_terms, 1) * _BYTES_OF_TERM))
+        if n_kept >= len(self._index):
+            return np.zeros(len(self._tint), np.float32)
+        term = np.where(self._index == 0, np.float32(np.inf), np.take(size, self._index) * self._scale)  # roots stay
+        least = np.partition(term, -n_kept)[-n_kept] if n_kept > 0 else np.float32(np.inf)
+        return np.divide(least, self._tint, out=np.full(len(self._tint), np.inf, np.float32), where=self._tint > 0)

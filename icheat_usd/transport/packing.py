@@ -180,31 +180,6 @@ def lossless(rows: SparseRows, tree: ClusterTree) -> PackedRows:
     return PackedRows(tree, rows.n_rows, _begin(counts), index[used], np.ones(counts.sum(), np.float32), value[used])
 
 
-def residual(packed: PackedTransport, radiance: F32) -> list[F32]:
-    """What packing loses of one light, to be added to the products at the records.
-
-    Parameters
-    ----------
-    radiance : (n_gather, 3)
-
-    Returns
-    -------
-    list of (n_rows, 3) float32
-        Exact minus packed product of each lobe; linear in `radiance`.
-
-    Raises
-    ------
-    ValueError
-        The exact rows were not kept.
-    """
-    if packed.source is None:
-        raise ValueError("a packed transport without its exact rows does not know what it lost")
-    return [
-        exact.rows.matmul(radiance) - lobe.rows.matmul(radiance)
-        for exact, lobe in zip(packed.source.lobes, packed.lobes, strict=True)
-    ]
-
-
 def _weigh(lobe: Lobe, interpolation: SparseRows | None, training: F32) -> _Weighted:
     square = np.mean(lobe.tint.astype(np.float64) ** 2, axis=1)
     if interpolation is not None:

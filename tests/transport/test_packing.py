@@ -128,6 +128,20 @@ def test_residual_makes_a_light_exact(scene: tuple[ClusterTree, F32, Transport])
     )
 
 
+def test_residuals_of_lights_add_up_with_their_gains(scene: tuple[ClusterTree, F32, Transport]) -> None:
+    tree, position, transport = scene
+    packed = pack_on_tree(transport, tree, lights(position, 8, 2), 0.1)
+    size = np.ones(N_LEAVES, np.float32)
+    narrow = packed.narrowed(size, packed.n_bytes // 3)
+    each = [np.repeat(light[:, None], 3, axis=1) for light in lights(position, 2, 5)]
+    gains = np.array([[2, 0.5, 0], [0.25, 1, 3]], np.float32)
+    total = sum(gain * b for gain, b in zip(gains, each, strict=True))
+    apart = sum(gain * residual(narrow, b)[0] for gain, b in zip(gains, each, strict=True))
+    exact = transport.lobes[0].rows.matmul(total)
+    np.testing.assert_allclose(narrow.lobes[0].rows.matmul(total) + apart, exact, rtol=2e-6, atol=2e-6 * exact.max())
+    assert np.abs(apart).max() > 1e-3 * exact.max()
+
+
 def test_narrowed_to_a_light_it_serves_that_light_better_than_another(
     scene: tuple[ClusterTree, F32, Transport],
 ) -> None:
