@@ -7,6 +7,7 @@ import shlex
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from icheat_usd.cli import main
@@ -23,7 +24,7 @@ def test_the_python_example_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    first, _ = blocks("python")
+    first, _, _ = blocks("python")
     exec(compile(first, "README.md", "exec"), {})
     assert float(capsys.readouterr().out) > 1.01
     assert (tmp_path / "after.exr").is_file() and (tmp_path / "after.png").is_file()
@@ -33,7 +34,7 @@ def test_the_pipeline_script_overrides_publishes_checks_and_compares(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    _, script = blocks("python")
+    _, script, _ = blocks("python")
     exec(compile(script, "README.md", "exec"), {})
     published, *shots = capsys.readouterr().out.splitlines()
     assert published == "3 payloads in sequence.published.v001.icheat.h5"
@@ -50,6 +51,20 @@ def test_the_pipeline_script_overrides_publishes_checks_and_compares(
     # The sequence's file is as it was but for the name of its sidecar; the shots wrote only to their own.
     assert "sequence.published.v001.icheat.h5" in (tmp_path / "film" / "sequence.usda").read_text()
     assert "sequence.v001" not in (tmp_path / "film" / "sequence.usda").read_text()
+
+
+def test_the_live_example_ends_in_the_layer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    _, _, live = blocks("python")
+    names: dict[str, object] = {}
+    exec(compile(live, "README.md", "exec"), names)
+    image = names["image"]
+    assert isinstance(image, np.ndarray) and image.shape == (64, 64, 3) and image.mean() > 0
+    assert len(list(tmp_path.glob("amount_*.png"))) == 5
+    fresh, committed = (
+        path / "shot.usda" for path in (resource_path("sample_stages/cornell_box"), tmp_path / "live_box")
+    )
+    assert committed.read_text() != Path(fresh).read_text()
 
 
 def test_the_shell_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,24 +127,22 @@ class LiveSession:
 
     def frame(self, out: F32 | None = None, *, level: Level | str = Level.PREVIEW) -> F32:
         """The image as it is now, (height, width, 3) float32, scene-linear; waits until it is at least this good."""
-        self.wait(level)
-        with self._frames.command():
+        with self._frames.looking(_level(level)):
             return self._frames.shown().frame(out)
 
     def film(self, *, level: Level | str = Level.REST) -> Film:
         """The image in layers, as `Session.relight` gives it, to be written; waits until it is at least this good."""
-        self.wait(level)
-        with self._frames.command():
+        with self._frames.looking(_level(level)) as frame:
             evaluator, stack = self._frames.shown(), self.stack
             settings = {**asdict(self.session.quality), "level": str(self.level)}
-            metadata = films.image_metadata(self._frames.here().snapshot, "live relight", stack, settings)
+            metadata = films.image_metadata(frame.snapshot, "live relight", stack, settings)
             return films.relit_film(evaluator.view, evaluator.relit(), metadata)
 
     @property
     def stack(self) -> EditStack:
         """The edit stack at the playhead with all changes."""
-        with self._frames.command():
-            return self._frames.state.laid_over(self._frames.stack_of(self._frames.here()))
+        with self._frames.looking() as frame:
+            return self._frames.state.laid_over(self._frames.stack_of(frame))
 
     @property
     def state(self) -> LiveState:
@@ -158,16 +156,13 @@ class LiveSession:
     @property
     def snapshot(self) -> SceneSnapshot:
         """The stage at the playhead, without changes."""
-        self.wait(Level.PREVIEW)
         return self._frames.here().snapshot
 
     def pick(self, x: int, y: int) -> tuple[str, F64] | None:
         """Surface and place (metres, stage axes) that a pixel shows, counted from the top left; None: the sky."""
-        self.wait(Level.PREVIEW)
-        with self._frames.command():
-            evaluator, frame = self._frames.here().evaluator, self._frames.here()
-            assert evaluator is not None
-            view = evaluator.view
+        with self._frames.looking() as frame:
+            assert frame.evaluator is not None
+            view = frame.evaluator.view
             sample = int(np.searchsorted(view.pixel, y * view.width + x))
             if sample >= view.n or view.pixel[sample] != y * view.width + x:
                 return None

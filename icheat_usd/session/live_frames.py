@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -103,6 +103,17 @@ class LiveFrames:
     def command(self) -> AbstractContextManager[None]:
         """Held while frames are looked at or changed; the background lets it go first."""
         return self._background.command()
+
+    @contextmanager
+    def looking(self, level: Level = Level.PREVIEW) -> Iterator[LiveFrame]:
+        """A command that needs the frame at the playhead: waits for it first, since none can come while one is held."""
+        while True:
+            self.wait(level)
+            with self.command():
+                frame = self.resident.get(self.resident.playhead)
+                if frame is not None and frame.level.reaches(level):
+                    yield frame
+                    return
 
     @property
     def level(self) -> Level:
