@@ -19,11 +19,13 @@ from icheat_usd.kernels.simd import (
     black,
     fetch,
     larger_size,
+    load,
     load_color,
     no_sum,
     plus_size,
     scaled,
     spread_pair,
+    store,
     store_color,
     store_colors,
     store_large,
@@ -35,7 +37,7 @@ _PARTS = 32
 
 @kernel
 def _find_large(begin, end, index, scale, size, least, number):  # type: ignore[no-untyped-def]
-    """Numbers of the coefficients whose terms can be `least` or more, even in count; the last may stand twice."""
+    """Numbers of the coefficients whose terms can be `least` or more, and how many they are."""
     count = 0
     indices, scales, sizes, numbers = address_of(index), address_of(scale), address_of(size), address_of(number)
     whole = begin + (end - begin) // 16 * 16
@@ -45,8 +47,6 @@ def _find_large(begin, end, index, scale, size, least, number):  # type: ignore[
         if size[index[k]] * scale[k] >= least:
             number[count] = k
             count += 1
-    if count % 2:
-        number[count] = number[count - 1]
     return count
 
 
@@ -115,6 +115,8 @@ def _multiply_run(  # type: ignore[no-untyped-def]
         version = pair_version[p]
         begin, end = tile_begin[pair_tile[p]], tile_begin[pair_tile[p] + 1]
         count = _find_large(begin, end, index, scale, size[version], least[version], number)
+        if count % 2:
+            number[count] = number[count - 1]  # counts nothing
         _scale_large(count, number, index, scale, value, coefficients[version], even, odd, bounds)
         choose_steps(count, bounds, steps, per_step)
         round_pairs((count + 1) // 2, even, odd, per_step, pairs)
@@ -140,3 +142,35 @@ def multiply_large_terms(  # type: ignore[no-untyped-def]
         _multiply_run(
             tile_begin, index, scale, value, coefficients, size, least, pair_tile, pair_version, first, last, out
         )
+
+
+@parallel_kernel
+def find_large_terms(tile_begin, index, scale, size, least, number, count):  # type: ignore[no-untyped-def]
+    """Coefficients of each tile whose terms ``scale * size (m,)`` are at least `least`.
+
+    Their numbers go to `number` (n,) from each tile's begin on, and how many they are to `count` (n_tiles,).
+    """
+    for t in prange(len(tile_begin) - 1):
+        begin, end = tile_begin[t], tile_begin[t + 1]
+        count[t] = _find_large(begin, end, index, scale, size, least, number[begin:end])
+
+
+@kernel
+def _copy_terms(number, index, scale, value, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+    n_bytes = value.shape[1]
+    source, target = address_of(value), address_of(out_value)
+    for i in range(len(number)):
+        k = np.int64(number[i])
+        out_index[i], out_scale[i] = index[k], scale[k]
+        for offset in range(0, n_bytes, 64):
+            store(target + offset, load(source + n_bytes * k + offset))
+        target += n_bytes
+
+
+@parallel_kernel
+def copy_terms(tile_begin, number, begin, index, scale, value, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+    """Terms found by `find_large_terms` to tiles, those of tile t from ``begin[t]`` on; values are bytes (n, 64 k)."""
+    for t in prange(len(tile_begin) - 1):
+        some = slice(begin[t], begin[t + 1])
+        found = number[tile_begin[t] : tile_begin[t] + begin[t + 1] - begin[t]]
+        _copy_terms(found, index, scale, value, out_index[some], out_scale[some], out_value[some])

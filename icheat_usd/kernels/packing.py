@@ -84,35 +84,6 @@ def multiply_tiles(tile_begin, index, scale, value, coefficients, out):  # type:
 
 
 @kernel
-def _is_large(e, index, scale, size, least):  # type: ignore[no-untyped-def]
-    """Whether a term is at least `least`, or of the root, which keeps uniform light right."""
-    return index[e] == 0 or size[index[e]] * scale[e] >= least
-
-
-@parallel_kernel
-def count_large(tile_begin, index, scale, size, least, count):  # type: ignore[no-untyped-def]
-    """Number of each tile's coefficients whose terms ``scale * size (m,)`` are at least `least`."""
-    for t in prange(len(tile_begin) - 1):
-        found = 0
-        for e in range(tile_begin[t], tile_begin[t + 1]):
-            if _is_large(e, index, scale, size, least):
-                found += 1
-        count[t] = found
-
-
-@parallel_kernel
-def copy_large(tile_begin, index, scale, value, size, least, begin, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
-    """The coefficients that `count_large` counts, those of tile t from ``begin[t]`` on."""
-    for t in prange(len(tile_begin) - 1):
-        place = begin[t]
-        for e in range(tile_begin[t], tile_begin[t + 1]):
-            if _is_large(e, index, scale, size, least):
-                out_index[place], out_scale[place] = index[e], scale[e]
-                out_value[place, :] = value[e]
-                place += 1
-
-
-@kernel
 def smooth_energy(left, right, node_weight, levels, share_of_all, energy, out):  # type: ignore[no-untyped-def]
     """Energy that a coefficient would have if its surroundings set it.
 

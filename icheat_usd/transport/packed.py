@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels import packing as kernels
+from icheat_usd.kernels.large_terms import copy_terms, find_large_terms
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_forward
 from icheat_usd.scene import F32, F64, I32, I64
@@ -74,15 +75,14 @@ class PackedRows:
 
     def of_large_terms(self, size: F32, least: float) -> PackedRows:
         """With the entries alone whose terms ``scale * size (n_leaves,)`` are at least `least`, and the roots."""
-        count = np.empty(self.n_tiles, np.int64)
-        terms = self.index, self.scale
-        kernels.count_large(self.tile_begin, *terms, size, np.float32(least), count)
+        of_roots = np.append(np.float32(np.inf), size[1:])
+        number, count = np.empty(len(self.index), np.int32), np.empty(self.n_tiles, np.int64)
+        find_large_terms(self.tile_begin, self.index, self.scale, of_roots, np.float32(least), number, count)
         begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
         index, scale = np.empty(begin[-1], np.int32), np.empty(begin[-1], np.float32)
         value = np.empty((begin[-1], LANES), self.value.dtype)
-        kernels.copy_large(
-            self.tile_begin, *terms, self.value, size, np.float32(least), begin[:-1], index, scale, value
-        )
+        terms = self.index, self.scale, self.value.view(np.int8)
+        copy_terms(self.tile_begin, number, begin, *terms, index, scale, value.view(np.int8))
         return replace(self, tile_begin=begin, index=index, scale=scale, value=value)
 
     def tiles(self, first: int, last: int) -> PackedRows:
