@@ -19,6 +19,7 @@ from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.groups import SampleGroups, TermTable
 from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
+from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.pair_products import PairProducts
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.relighter import RelitView
@@ -81,6 +82,7 @@ class LiveRelighter:
         self._base_stale = True
         self._own: F32 = np.zeros((view.n, 3), np.float32)  # of samples that do not share their light with a group
         self._lights_seen: Any = None
+        self._moves_seen: Any = None
         self._light_stale = True
         self._stack = LiveStack(snapshot, view, gather, True)
         self._history: History | None = None
@@ -103,8 +105,10 @@ class LiveRelighter:
         self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
         self._exact_products: Products | None = None
         self._is_exact = False
+        self._narrow: Narrow | None = None
         if exact is not None and exact is not transport:
             self._exact_products = Products(exact, self.gather.tree, self._products.names)
+            self._narrow = Narrow(self._products, self._exact_products)
         # Uncompressed means exact: what is interpolated is then the transport alone, not what edits make of it.
         self._stack.set_at_records(isinstance(transport, PackedTransport) or transport.interpolation is None)
         self._regroup()
@@ -244,13 +248,22 @@ class LiveRelighter:
     def refine(self) -> bool:
         """At rest: bring lights to their final quality, then take back what packing lost; False when nothing is left.
 
-        What is reached then depends on lights and stack alone.
+        What is reached then depends on lights and stack alone. From then on frames keep to the part of the
+        transport that matters to these lights and edits, until a light is changed by more than its gain. What
+        that loses is added back: the unedited light stays that of the exact rows under all gains, and each
+        version of it while the difference that its edits make is a multiple of what it was. Where it is not, the
+        rest of it (orthogonal to what it was) is as the narrowed rows have it; versions that are new, or whose
+        casters were painted, have all of the rows.
         """
         if self.lights.refine():
             return True
         self._update()
-        if self._exact_products is not None:
-            self._versions.refine(self._exact_products)
+        if self._exact_products is not None and self._narrow is not None:
+            if self._narrow.step(self.lights.radiance, self.lights.gains, self._versions.n):
+                self._versions.forget_residuals()
+                return True
+            if self._versions.refine(self._exact_products):
+                return True
             if not self._is_exact:
                 self._shared.set_unedited(self._light(), self._exact_products)
                 self._base_stale = True
@@ -272,7 +285,7 @@ class LiveRelighter:
                 self._regroup()
                 raise
             return
-        self._versions.stack_changed(self._stack.compiled, change.rows)
+        self._versions.stack_changed(self._stack.compiled, change.rows, change.painted)
         self._changed_rows.update(change.rows)
         if len(change.samples):
             self._changed_samples.append(change.samples)
@@ -296,6 +309,8 @@ class LiveRelighter:
         self._changed_samples: list[I64] = []
         self._samples_of: dict[frozenset[int], I64] = {}
         self._light_stale = True
+        if self._narrow is not None:
+            self._narrow.versions_changed()
         self._place(np.flatnonzero((stack.receiver_masks != 0).any(axis=0)))
 
     def _refuse_pairs(self) -> None:
@@ -374,7 +389,10 @@ class LiveRelighter:
             return
         if self._light_stale:
             self._by_group = self._light_by_group()
-            self._shared.set_unedited(self._light())
+            if self._narrow is not None and self._narrow.is_ready:
+                self._shared.set_unedited_at_rest(self._light(), self._narrow, self.lights.gains)
+            else:
+                self._shared.set_unedited(self._light())
             self._is_exact = False
             self._base_stale = True
             self._versions.light_changed(self._by_group)
@@ -407,6 +425,12 @@ class LiveRelighter:
         # Lights that do not tell are taken to have changed.
         self._light_stale |= revision is None or revision != self._lights_seen
         self._lights_seen = revision
+        moved = getattr(self.lights, "moves", revision)
+        if moved is None or moved != self._moves_seen:
+            if self._narrow is not None:
+                self._narrow.forget()
+            self._versions.forget_residuals()
+        self._moves_seen = moved
 
     def _light_paths(self) -> tuple[str, ...]:
         return tuple(getattr(self.lights, "paths", self._snapshot.light_paths))

@@ -28,6 +28,7 @@ class Change(NamedTuple):
 
     rows: list[int]  #: whose casters send otherwise
     samples: I64  #: ascending, whose receiver masks are others
+    painted: list[int]  #: rows whose caster masks are others
 
 
 class _Exchange(NamedTuple):
@@ -177,7 +178,8 @@ class LiveStack:
         self.compiled = replace(compiled, field=self.field)
         rows = [row for found in exchanges if found.sends_otherwise for row in self._rows(found.edit)]
         # Points of one mask are ascending already.
-        return Change(rows, samples[-1] if len(samples) < 3 else np.unique(np.concatenate(samples)))
+        painted = [row for found in exchanges for row, _, _ in found.casters]
+        return Change(rows, samples[-1] if len(samples) < 3 else np.unique(np.concatenate(samples)), painted)
 
     def _exchanged(self, edit: int, now: Edit) -> _Exchange:
         before = self.field.edits[edit]

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icheat_usd.kernels import versions as kernels
-from icheat_usd.kernels.packed import multiply_paired_tiles, pair_coefficients
+from icheat_usd.kernels.packed import PairedTiles, multiply_paired_tiles, pair_coefficients
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
 from icheat_usd.scene import F32, F64, I32, I64, U8
 from icheat_usd.transport import SparseRows, Transport
-from icheat_usd.transport.packed import LANES, PackedTransport
+from icheat_usd.transport.packed import LANES, PackedRows, PackedTransport
 
 #: Versions with more cells than this are transformed as a whole, by all cores.
 _MANY_CELLS = 4096
@@ -32,6 +34,17 @@ class VersionTables(NamedTuple):
     restrict: I64  #: (n_versions, 3) see `kernels.versions.version_deltas`
 
 
+class _Rows:
+    """Rows of one lobe, and as kernels read them if they are quantised."""
+
+    def __init__(self, rows: Any) -> None:
+        self.rows = rows
+        self.paired: PairedTiles | None = None
+        if isinstance(rows, PackedRows) and rows.value.dtype == np.int8:
+            quanta = cast(NDArray[np.int8], rows.value)
+            self.paired = pair_coefficients(rows.tile_begin, rows.index, rows.scale, quanta)
+
+
 class Products:
     """One transport, and what each version of the light is in the basis of its rows."""
 
@@ -43,8 +56,10 @@ class Products:
             lobe for lobe in transport.lobes if (_n_entries(lobe.rows) if names is None else lobe.name in names)
         ]
         self.names = tuple(lobe.name for lobe in lobes)
-        self._rows = [lobe.rows for lobe in lobes]
         self._haar = isinstance(transport, PackedTransport)
+        self._packed = replace(transport, lobes=tuple(lobes)) if isinstance(transport, PackedTransport) else None
+        self._rows: list[_Rows] = [_Rows(lobe.rows) for lobe in lobes]
+        self._narrow: list[_Rows] | None = None
         self._n_leaves = tree.n_leaves
         self._tree = tree
         n_view = len(transport.lobes[0].tint)
@@ -61,16 +76,27 @@ class Products:
             self._share, self._root = _shares(tree)
             self._plan = plan_haar(tree)
             self._unedited: F32 = np.zeros((1, self._n_leaves, 4), np.float32)
-            self._paired = [
-                pair_coefficients(rows.tile_begin, rows.index, rows.scale, rows.value)
-                if rows.value.dtype == np.int8
-                else None
-                for rows in self._rows
-            ]
 
     def room(self, n_pairs: int) -> F32:
         """Place for products, (n_lobes, n_pairs, 64, 4)."""
         return np.zeros((len(self._rows), n_pairs, LANES, 4), np.float32)
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether there are narrowed rows beside the others."""
+        return self._narrow is not None
+
+    def narrow(self, lights: F32, n_versions: int, max_bytes: int) -> None:
+        """Keep, beside the rows, what of them matters to lights (n_lights, n_leaves, 3) and the first versions."""
+        assert self._packed is not None
+        sizes = np.abs(self._versions[:n_versions]).max(axis=(0, 2), initial=0.0)
+        for light in lights:
+            np.maximum(sizes, np.abs(haar_of_versions(self._plan, light[None])).max(axis=(0, 2)), out=sizes)
+        self._narrow = [_Rows(lobe.rows) for lobe in self._packed.narrowed(sizes, max_bytes).lobes]
+
+    def widen(self) -> None:
+        """Forget the narrowed rows."""
+        self._narrow = None
 
     def clear(self) -> None:
         """Forget all versions."""
@@ -119,8 +145,8 @@ class Products:
             values[0, tables.cells[some]] = deltas[some]
             haar_of_versions(self._plan, values, self._versions[version : version + 1])
 
-    def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32) -> None:
-        """Products of some pairs of tile and version into ``out[:, pairs]``."""
+    def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:
+        """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows."""
         if not len(pairs):
             return
         tile, version = pair_tile[pairs], pair_version[pairs]
@@ -128,7 +154,7 @@ class Products:
         part = slice(pairs[0], pairs[-1] + 1)
         for lobe in range(len(self._rows)):
             into = out[lobe, part] if direct else np.empty((len(pairs), LANES, 4), np.float32)
-            self._multiply(lobe, self._versions, tile, version, into)
+            self._multiply(lobe, self._versions, tile, version, into, narrow)
             if not direct:
                 out[lobe, pairs] = into
 
@@ -138,10 +164,10 @@ class Products:
         leaves = np.zeros((1, self._n_leaves, 4), np.float32)
         leaves[0, cells, :3] = values
         for lobe in range(len(self._rows)):
-            self._multiply(lobe, leaves, tile, np.zeros_like(tile), out[lobe])
+            self._multiply(lobe, leaves, tile, np.zeros_like(tile), out[lobe], False)
 
-    def multiply_all(self, b: F32, out: F32) -> None:
-        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``."""
+    def multiply_all(self, b: F32, out: F32, narrow: bool = False) -> None:
+        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``; `narrow`: as `multiply`."""
         if self._haar:
             values = haar_of_versions(self._plan, b[None], self._unedited)
         else:
@@ -149,14 +175,15 @@ class Products:
             values[0, :, :3] = b
         tile = np.arange(self.n_tiles, dtype=np.int32)
         for lobe in range(len(self._rows)):
-            self._multiply(lobe, values, tile, np.zeros_like(tile), out[lobe, : self.n_tiles])
+            self._multiply(lobe, values, tile, np.zeros_like(tile), out[lobe, : self.n_tiles], narrow)
 
-    def _multiply(self, lobe: int, versions: F32, tile: I32, version: I32, out: F32) -> None:
-        rows = self._rows[lobe]
+    def _multiply(self, lobe: int, versions: F32, tile: I32, version: I32, out: F32, narrow: bool) -> None:
+        chosen = self._narrow if narrow else self._rows
+        assert chosen is not None
+        rows, paired = chosen[lobe].rows, chosen[lobe].paired
         if not self._haar:
             kernels.multiply_sparse_pairs(rows.indptr, rows.indices, rows.weights, versions, tile, version, out)
             return
-        paired = self._paired[lobe]
         if paired is None:
             kernels.multiply_pairs(rows.tile_begin, rows.index, rows.scale, rows.value, versions, tile, version, out)
             return

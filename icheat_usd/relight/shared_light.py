@@ -9,6 +9,7 @@ import numpy as np
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.kernels.assemble import InterpolationTable, assemble_film, assemble_view, interpolation_table
 from icheat_usd.relight.groups import SampleGroups, TermTable
+from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.versions import Versions
 from icheat_usd.samples import ViewSamples
@@ -105,6 +106,11 @@ class SharedLight:
     def set_unedited(self, b: F32, products: Products | None = None) -> None:
         """Multiply the transport, or the `products` of exact rows, with the unedited light (n_gather, 3)."""
         (products or self._products).multiply_all(b, self._sums)
+
+    def set_unedited_at_rest(self, b: F32, narrow: Narrow, gains: F32) -> None:
+        """The same with the narrowed transport, of lights at rest under gains."""
+        self._products.multiply_all(b, self._sums, narrow=True)
+        narrow.add(gains, self._sums)
 
     def unedited(self, out: F32) -> None:
         """Unedited indirect light of all view samples into `out`."""

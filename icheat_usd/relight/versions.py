@@ -9,12 +9,15 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels.residuals import add_version_residuals, proportions
 from icheat_usd.relight.compiled import CompiledStack, Way
 from icheat_usd.relight.pair_products import PairProducts, PairSum
 from icheat_usd.relight.products import Products, VersionTables
 from icheat_usd.scene import F32, F64, I32, I64, U8
 from icheat_usd.transport.packed import LANES
 
+#: Pairs of tile and version that are refined at once, about.
+_PAIRS_AT_ONCE = 500
 #: Casters of a version that are evaluated in one piece.
 _PIECE = 2048
 
@@ -54,6 +57,9 @@ class Versions:
         self._deltas: F32 = np.zeros((0, 3), np.float32)
         self._stale: set[int] = set()
         self._refined: set[int] = set()
+        self._known: set[int] = set()  # whose residual is known
+        self._reference: F32 = np.zeros((0, 3), np.float32)  # what the differences of these were then
+        self._lost: F32 = products.room(0)  # (n_lobes, n_pairs, 64, 4) what narrowed rows lost of that
         self._pairs_of: list[I64] = []
         self._light: F32 | None = None
         self.offsets: F64 = np.zeros((0, 6))  #: (n_versions, 6) light without transport: to be reflected, and not
@@ -76,9 +82,11 @@ class Versions:
             self._tables = None
         return self._number[key]
 
-    def stack_changed(self, compiled: CompiledStack, rows: Iterable[int]) -> None:
-        """Go on with another stack of the same structure, of which some rows act differently."""
+    def stack_changed(self, compiled: CompiledStack, rows: Iterable[int], painted: Iterable[int]) -> None:
+        """Go on with another stack of the same structure, of which some rows act differently, some on other casters."""
         self._compiled = compiled
+        # What is lost of a difference follows from what was lost before only while it stays similar.
+        self._known -= {v for v in self._known if not self._versions[v].rows.isdisjoint(painted)}
         changed = set(rows)
         if changed:
             self._changed_rows[1 + np.array(sorted(changed))] = 1
@@ -86,6 +94,10 @@ class Versions:
             self._stale |= stale
             if self._pair_products is not None:
                 self._pair_products.stack_changed(stale)
+
+    def forget_residuals(self) -> None:
+        """Multiply with all of the rows until the next refinement."""
+        self._known = set()
 
     def light_changed(self, b: F32) -> None:
         """Take other light, (G, n_gather, 3)."""
@@ -106,11 +118,15 @@ class Versions:
         grown = self._products.room(len(self._pair_tile))
         grown[:, :first] = self.values
         self.values = grown
+        lost = self._products.room(len(self._pair_tile) if self._known else 0)
+        lost[:, : self._lost.shape[1]] = self._lost[:, : lost.shape[1]]
+        self._lost = lost
         order = np.argsort(self._pair_version, kind="stable")
         ends = np.searchsorted(self._pair_version[order], np.arange(self.n + 1))
         self._pairs_of = [order[ends[v] : ends[v + 1]].astype(np.int64) for v in range(self.n)]
         self._stale |= {v for v in set(version.tolist()) if self._versions[v].by_pairs}
         self._refined -= set(version.tolist())
+        self._known -= set(version.tolist())
         # Those whose version is evaluated anyway are multiplied then.
         fresh = np.arange(first, len(self._pair_tile))
         done = ~np.isin(self._pair_version[fresh], list(self._stale))
@@ -156,8 +172,10 @@ class Versions:
             np.add.at(self.offsets, pieces[:, 0], sums)
         plain = np.array([v for v in stale if not self._versions[v].by_pairs], np.int64)
         self._products.prepare(plain, tables, self._deltas)
-        pairs = np.concatenate([np.empty(0, np.int64), *(self._pairs_of[v] for v in plain)])
+        known = np.array([v in self._known for v in plain], np.bool_)
+        pairs = self._pairs_of_some(plain[~known])
         self._products.multiply(pairs, self._pair_tile, self._pair_version, self.values)
+        self._multiply_narrow(plain[known])
         for v in stale:
             if self._versions[v].by_pairs:
                 self._multiply_by_pairs(int(v))
@@ -165,21 +183,60 @@ class Versions:
         self._stale = set()
         self._changed_rows[:] = 0
 
-    def refine(self, exact: Products) -> None:
-        """Multiply with exact rows what was multiplied with packed ones."""
+    def _pairs_of_some(self, versions: I64) -> I64:
+        return np.concatenate([np.empty(0, np.int64), *(self._pairs_of[v] for v in versions)])
+
+    def _multiply_narrow(self, versions: I64) -> None:
+        """With narrowed rows, and with what these lost the last time of a difference of about the same shape."""
+        if not len(versions):
+            return
+        assert self._tables is not None
+        pairs = self._pairs_of_some(versions)
+        self._products.multiply(pairs, self._pair_tile, self._pair_version, self.values, narrow=True)
+        factors = np.zeros((self.n, LANES), np.float32)
+        proportions(versions, self._tables.cell_begin, self._deltas, self._reference, factors)
+        lost, values = (array.reshape(*array.shape[:2], 4 * LANES) for array in (self._lost, self.values))
+        add_version_residuals(pairs, self._pair_version, lost, factors, values)
+
+    def refine(self, exact: Products) -> bool:
+        """Multiply some versions with exact rows that were multiplied with packed ones; False when none is left."""
         self.update()
         self._arrange()
         tables = self._tables
         assert tables is not None
+        narrow = self._products.is_narrow
+        n_done = 0
         for v, version in enumerate(self._versions):
             pairs = self._pairs_of[v]
-            if version.by_pairs or v in self._refined or not len(pairs):
+            known = v in self._refined and (v in self._known or not narrow)
+            if version.by_pairs or known or not len(pairs):
                 continue
+            if n_done > _PAIRS_AT_ONCE:
+                return True
+            n_done += len(pairs)
             some = slice(tables.cell_begin[v], tables.cell_begin[v + 1])
             out = exact.room(len(pairs))
             exact.multiply_cells(tables.cells[some], self._deltas[some], self._pair_tile[pairs], out)
+            if narrow:
+                self._learn_residual(v, out)
             self.values[:, pairs] = out
             self._refined.add(v)
+        return False
+
+    def _learn_residual(self, v: int, exact: F32) -> None:
+        """Keep what narrowed rows lose of a version of which the exact products are known."""
+        assert self._tables is not None
+        if self._lost.shape[1] != len(self._pair_tile):
+            self._lost = self._products.room(len(self._pair_tile))
+        if len(self._reference) != len(self._deltas):
+            reference = np.zeros_like(self._deltas)
+            reference[: len(self._reference)] = self._reference
+            self._reference = reference
+        pairs, some = self._pairs_of[v], slice(self._tables.cell_begin[v], self._tables.cell_begin[v + 1])
+        self._products.multiply(pairs, self._pair_tile, self._pair_version, self.values, narrow=True)
+        self._lost[:, pairs] = exact - self.values[:, pairs]
+        self._reference[some] = self._deltas[some]
+        self._known.add(v)
 
     def _multiply_by_pairs(self, v: int) -> None:
         assert self._pair_products is not None and self._light is not None

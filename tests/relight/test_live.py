@@ -211,6 +211,92 @@ def test_refining_takes_back_what_packing_loses():
     np.testing.assert_array_equal(shown.frame(), refined)
 
 
+class RestingLights(StillLights):
+    moves = 0
+
+
+def poor(of: PackedTransport) -> PackedTransport:
+    """Int8 rows in few coefficients."""
+    lobes = []
+    for lobe in of.lobes:
+        rows = lobe.rows
+        scale = np.maximum(np.abs(rows.value).max(axis=1), 1e-20).astype(np.float32) / 127
+        quanta = np.rint(rows.value / scale[:, None]).astype(np.int8)
+        size = np.sqrt(np.square(rows.value).sum(axis=1))
+        kept = size > np.quantile(size, 0.6)
+        begin = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)[rows.tile_begin]
+        rows = replace(rows, tile_begin=begin, index=rows.index[kept], scale=scale[kept], value=quanta[kept])
+        lobes.append(replace(lobe, rows=rows))
+    return replace(of, lobes=tuple(lobes))
+
+
+def test_lights_at_rest_lose_nothing_in_a_narrowed_transport(monkeypatch):
+    """Gains, and amounts of edits that scale, find the light of the exact rows; a light that moves has all rows."""
+    of = pipeline("full")
+    rows = poor(packed("full"))
+    monkeypatch.setattr("icheat_usd.relight.narrow.NARROW_BYTES", rows.n_bytes // 4)
+    lights = RestingLights(of)
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights)
+    edits = (soft("a", "scale", "/floor", "/red", 3), edit("b", "scale", select("/back"), select("/red", "/green")))
+    shown.set_stack(EditStack("/stack", edits))
+    while shown.refine():
+        pass
+
+    def error_of_edits(found: LiveRelighter) -> float:
+        exact, seen = fresh(of, shown.stack, lights.gains).relit(), found.relit()
+        # Light is rounded to 16 bits.
+        if found is shown:
+            np.testing.assert_allclose(seen.indirect, exact.indirect, rtol=1e-3, atol=1e-4 * exact.indirect.max())
+        expected = exact.indirect_edited - exact.indirect
+        return float(np.abs(seen.indirect_edited - seen.indirect - expected).max() / np.abs(expected).max())
+
+    for light in (0, 1):
+        lights.set_gain(light, (0.3, 1.2, 2.0))
+    shown.set_amount("/a", 0.35)
+    assert error_of_edits(shown) < 0.002
+    lights.set_gain(1, 0.1)
+    assert error_of_edits(shown) < error_of_edits(fresh_packed(of, rows, shown.stack, lights.gains))
+    unedited = shown.relit().indirect
+    lights.moves += 1
+    lights.revision += 1
+    found = shown.relit().indirect
+    assert np.abs(found / unedited - 1).max() > 0.02
+    np.testing.assert_array_equal(found, fresh_packed(of, rows, shown.stack, lights.gains).relit().indirect)
+
+
+def fresh_packed(of: Pipeline, rows: PackedTransport, stack: EditStack, gains: F32) -> LiveRelighter:
+    lights = StillLights(of)
+    lights.gains[:] = gains
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights)
+    shown.set_stack(stack)
+    return shown
+
+
+def test_casters_painted_at_rest_have_all_rows(monkeypatch):
+    of = pipeline("full")
+    rows = poor(packed("full"))
+    monkeypatch.setattr("icheat_usd.relight.narrow.NARROW_BYTES", rows.n_bytes // 8)
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, RestingLights(of))
+    stack = EditStack("/stack", (soft("a", "scale", "/floor", "/red", 3),))
+    shown.set_stack(stack)
+    while shown.refine():
+        pass
+    mask = stack.edits[0].keys[1].payload.caster_mask
+    shown.dab("/a", "casters", repainted(mask, np.random.default_rng(1)), key=1)
+    shown.frame()
+    again = fresh_packed(of, rows, shown.stack, np.ones((2, 3)))
+    again.frame()
+    painted = shown._versions
+    pairs = np.concatenate([painted._pairs_of[v] for v, version in enumerate(painted._versions) if 1 in version.rows])
+    assert len(pairs)
+    np.testing.assert_array_equal(painted.values[:, pairs], again._versions.values[:, pairs])
+    while shown.refine():
+        pass
+    while again.refine():
+        pass
+    np.testing.assert_array_equal(shown.frame(), again.frame())
+
+
 def test_one_thread_has_the_bits_of_two():
     of = pipeline("full")
     edits = (edit("a", "scale"), soft("b", "gamma", "/floor", "/red", 1), edit("c", "falloff"), edit("d", "paint"))
