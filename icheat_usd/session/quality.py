@@ -49,9 +49,9 @@ def coarse(quality: Quality) -> Quality:
     """What to show within seconds, while a preview of this quality is made."""
     return replace(
         quality,
-        n_gather=min(quality.n_gather, 8_192),
+        n_gather=min(quality.n_gather, 4_096),
         rays_per_row=min(quality.rays_per_row, 64),
-        rays_per_bounce_row=min(quality.rays_per_bounce_row, 32),
+        rays_per_bounce_row=min(quality.rays_per_bounce_row, 16),
         row_spacing=max(quality.row_spacing, 8),
         record_error=None,
         packing_error=None,

@@ -118,8 +118,8 @@ class ShotParts:
     def transport(self) -> Transport:
         """Exact rows, at all view samples or at records."""
 
-        def make(_: Shelf | None) -> Transport:
-            return deque(self._measured(), maxlen=1).pop()
+        def make(shelf: Shelf | None) -> Transport:
+            return deque(self._measured(shelf), maxlen=1).pop()
 
         needs = ("gather",) if self.quality.record_error is None else ("training",)
         return self._kept("transport", needs, make)
@@ -141,16 +141,18 @@ class ShotParts:
         is_packed = self.quality.packing_error is not None
         if "transport" not in self.__dict__ and not self._is_on_disk("packed" if is_packed else "transport"):
             last: Transport | None = None
-            for last in self._measured():
+            shelf = self._shelf("transport") if self._disk.is_on else None
+            for last in self._measured(shelf):
                 yield last
             assert last is not None
             self.__dict__["transport"] = last
-            self._keep("transport", last)
+            if shelf is not None:
+                self._keep_whole(shelf, last)
             if not is_packed:
                 return
         yield self.packed if is_packed else self.transport
 
-    def _measured(self) -> Iterator[Transport]:
+    def _measured(self, shelf: Shelf | None) -> Iterator[Transport]:
         quality = self.quality
         if quality.record_error is None:
             yield build_transport(
@@ -174,6 +176,7 @@ class ShotParts:
             rays_per_row=quality.record_rays,
             seed=quality.seed,
             progress=self.progress,
+            parts=shelf,
         )
 
     @cached_property
@@ -249,19 +252,22 @@ class ShotParts:
         began = time.perf_counter()
         made = make(shelf)
         if time.perf_counter() - began > WORTH_KEEPING_SECONDS:
-            shelf.save("whole", made)
-            shelf.drop(*(name for name in shelf.names() if name != "whole"))
+            self._keep_whole(shelf, made)
+        else:
+            shelf.drop(*shelf.names())
         return made
+
+    @staticmethod
+    def _keep_whole(shelf: Shelf, whole: Any) -> None:
+        """Keep a part instead of the pieces that it was made of."""
+        shelf.save("whole", whole)
+        shelf.drop(*(name for name in shelf.names() if name != "whole"))
 
     def _shelf(self, kind: str) -> Shelf:
         return self._disk.shelf(kind, getattr(self.keys, kind), self._about())
 
     def _is_on_disk(self, kind: str) -> bool:
         return self._disk.is_on and "whole" in self._shelf(kind).names()
-
-    def _keep(self, kind: str, part: Any) -> None:
-        if self._disk.is_on:
-            self._shelf(kind).save("whole", part)
 
     def _about(self) -> dict[str, Any]:
         """For people who look at the cache."""

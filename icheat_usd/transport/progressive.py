@@ -13,6 +13,7 @@ from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport.build import Lobe, Transport
+from icheat_usd.transport.pieces import PartStore, Pieces
 from icheat_usd.transport.rays import MeasuredRows, RowBuilder
 from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
 from icheat_usd.transport.sparse import SparseRows, concatenate_rows
@@ -34,6 +35,7 @@ def build_transports(
     rays_per_row: int = 2048,
     seed: int = 0,
     progress: Progress = silent,
+    parts: PartStore | None = None,
 ) -> Iterator[Transport]:
     """Measure the transport at adaptively placed records; better and better, each one usable.
 
@@ -43,6 +45,8 @@ def build_transports(
         What plausible lights make leave the cells: `training_radiance`.
     rays_per_row
         Of the last transport, per record and lobe.
+    parts
+        Where rows that were traced before are found, and those that are traced now are kept.
 
     Yields
     ------
@@ -62,21 +66,30 @@ def build_transports(
     )  # of its pixel's light, where several share it
     colours = view.points.albedo, view.points.specular, view.points.specular_edge
     tint = np.stack([_scalar(colour) * share for colour in colours])
-    parts: list[list[SparseRows]] = [[], [], []]
+    placed: list[list[SparseRows]] = [[], [], []]
+    pieces = Pieces(parts)
 
     def rows_of(samples: I64, stream: I64, first_ray: int, n_rays: int, of_rays: int) -> MeasuredRows:
-        points = take_points(view.points, samples)
-        one_each = np.arange(len(samples) + 1, dtype=np.int64)
-        return builder.measure(
-            points, one_each, stream, n_rays, 0, progress, "gather rays", first_ray=first_ray, of_rays=of_rays
-        )
+        def make(rows: I64) -> MeasuredRows:
+            points = take_points(view.points, samples[rows])
+            one_each = np.arange(len(rows) + 1, dtype=np.int64)
+            step = "gather rays"
+            return builder.measure(
+                points, one_each, stream[rows], n_rays, 0, progress, step, first_ray=first_ray, of_rays=of_rays
+            )
+
+        return pieces.measured(np.arange(len(samples)), n_rays, make)
 
     def specular(samples: I64, stream: I64, n_rays: int) -> list[SparseRows]:
-        points = take_points(view.points, samples)
-        glossy = np.flatnonzero(is_glossy(points))
-        if not len(glossy):
-            return [SparseRows.empty(len(samples), gather.n)] * 2
-        return list(builder.specular_rows(points, view.to_eye[samples], stream, glossy, n_rays, progress))
+        def make(rows: I64) -> tuple[SparseRows, SparseRows]:
+            points = take_points(view.points, samples[rows])
+            glossy = np.flatnonzero(is_glossy(points))
+            if not len(glossy):
+                nothing = SparseRows.empty(len(rows), gather.n)
+                return nothing, nothing
+            return builder.specular_rows(points, view.to_eye[samples[rows]], stream[rows], glossy, n_rays, progress)
+
+        return list(pieces.both(np.arange(len(samples)), n_rays, make))
 
     def probe(samples: I64) -> F32:
         out = np.zeros((2, 3, len(samples), lights.shape[1]), np.float32)
@@ -85,20 +98,20 @@ def build_transports(
         one = rows_of(samples, stream, 0, half, _PLACING_RAYS)
         two = rows_of(samples, stream, half, half, _PLACING_RAYS)
         out[0, 0], out[1, 0] = one.cells.matmul(lights), two.cells.matmul(lights)
-        parts[0].append(one.continued(two).cells)
+        placed[0].append(one.continued(two).cells)
         for lobe, rows in enumerate(specular(samples, stream, _PLACING_RAYS), 1):
             out[:, lobe] = rows.matmul(lights)
-            parts[lobe].append(rows)
+            placed[lobe].append(rows)
         return out
 
     settings = settings or RecordSettings()
     records: Records | None = None
     for records in place_records(view, snapshot.camera, probe, tint, settings):
-        rows = [concatenate_rows(list(part), gather.n) for part in parts]
-        parts = [[part] for part in rows]
+        rows = [concatenate_rows(list(part), gather.n) for part in placed]
+        placed = [[part] for part in rows]
         yield _transport(view, records, rows, _PLACING_RAYS, seed, np.zeros(len(records.view), np.int64))
     assert records is not None
-    parts.clear()
+    placed.clear()
     samples = records.view.astype(np.int64)
     measured: MeasuredRows | None = None
     n_rays = min(rays_per_row, 2 * _PLACING_RAYS)
