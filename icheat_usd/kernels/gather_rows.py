@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 from llvmlite import ir
 from numba import get_num_threads, prange, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
@@ -45,6 +46,25 @@ def _trailing_zeros(typingctx: Any, word: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return types.uint64(types.uint64), codegen
+
+
+@cast(Any, intrinsic)  # as a caller sees it: without the typing context
+def _fetch(typingctx: Any, column: Any, row: Any) -> Any:
+    """Begin to load row `row` of a C-contiguous array, which is not waited for."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        stride = builder.extract_value(array.strides, 0)
+        pointer = ir.IntType(8).as_pointer()
+        base = builder.ptrtoint(array.data, stride.type)
+        address = builder.inttoptr(builder.add(base, builder.mul(stride, args[1])), pointer)
+        number = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
+        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        builder.call(callee, [address, ir.Constant(number, 0), ir.Constant(number, 3), ir.Constant(number, 1)])
+        return context.get_dummy_value()
+
+    return types.void(column, types.int64), codegen
 
 
 @kernel
@@ -169,7 +189,8 @@ def count_hits(  # type: ignore[no-untyped-def]
         bin_of, bin_begin = np.empty(BATCH, np.int32), np.empty(_BINS * _BINS + 2, np.int64)
         key = np.empty(BATCH, np.int32)
         entries, listed = np.empty(16, np.int64), np.empty(16, np.int64)
-        instances, sides, at = np.empty(16, np.int64), np.empty(16, np.int64), np.empty((16, 6), np.float32)
+        instances, triangles = np.empty(16, np.int64), np.empty(16, np.int64)
+        sides, at = np.empty(16, np.int64), np.empty((16, 6), np.float32)
         stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
         storage = np.zeros(24 * 16 + 16 + 64, np.float32)
         shift = np.int64((-storage.ctypes.data % 64) // 4)
@@ -227,6 +248,14 @@ def count_hits(  # type: ignore[no-untyped-def]
                     _trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
                     # In steps over the packet, so that the loads of one ray do not wait for those of another.
                     for k in range(width):
+                        if words[18, k] != _INVALID:
+                            i = np.int64(words[18, k] if words[19, k] == _INVALID else words[19, k])
+                            t = mesh_begin[instance_mesh[i]] + np.int64(words[17, k])
+                            instances[k], triangles[k] = i, t
+                            _fetch(points, t)
+                            _fetch(triangle_route, t)
+                            _fetch(face, max(0, 2 * (place[i] + t)))
+                    for k in range(width):
                         e = order[first + k]
                         entries[k] = NOTHING
                         listed[k] = 0
@@ -234,8 +263,7 @@ def count_hits(  # type: ignore[no-untyped-def]
                             if sky_bins > 0:
                                 entries[k] = n_cells + octahedral_bin(x[e], y[e], z[e], sky_bins)
                             continue
-                        i = np.int64(words[18, k] if words[19, k] == _INVALID else words[19, k])
-                        t = mesh_begin[instance_mesh[i]] + np.int64(words[17, k])
+                        i, t = instances[k], triangles[k]
                         if triangle_route[t] != 0:
                             entries[k] = DETOUR
                             continue
@@ -246,9 +274,16 @@ def count_hits(  # type: ignore[no-untyped-def]
                         entries[k] = entry_at(place, face, square, i, t, side, rays[15, k], rays[16, k])
                         if entries[k] < 0:
                             listed[k] = 1
-                            instances[k], sides[k] = i, side
+                            sides[k] = side
+                            if entries[k] != WALK:
+                                _fetch(candidates, -1 - entries[k])
                             at[k, 0], at[k, 1], at[k, 2] = place_on(points, to_world, i, t, rays[15, k], rays[16, k])
                             at[k, 3], at[k, 4], at[k, 5] = unit_normal(plane, side)
+                    for k in range(width):
+                        if listed[k] == 1 and entries[k] != WALK:
+                            begin = -entries[k]
+                            for a in range(begin, begin + min(candidates[begin - 1], 4)):
+                                _fetch(sample, candidates[a])
                     for k in range(width):
                         found = entries[k]
                         if listed[k] == 1:

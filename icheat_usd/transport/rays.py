@@ -192,10 +192,16 @@ class RowBuilder:
         ray = np.empty(begin[-1], np.int32)
         row_kernels.pack_ints(n_detours, begin, detour, ray)
         row = np.repeat(np.arange(n), n_detours)
-        return add_shares(rows, 1, _counted(row, *self._ends(rays, row, ray, sky), n, counter.n_keys), 1, 1)
+        ends = self._ends(rays, row, ray, sky, all_detour=True)
+        return add_shares(rows, 1, _counted(row, *ends, n, counter.n_keys), 1, 1)
 
-    def _ends(self, rays: _Rays, row: I64, ray: I32 | I64, sky: SkyBins | None) -> tuple[I64, I64, I64]:
-        """Where some rays end: number of the ray in `row`, column and units of light."""
+    def _ends(
+        self, rays: _Rays, row: I64, ray: I32 | I64, sky: SkyBins | None, all_detour: bool = False
+    ) -> tuple[I64, I64, I64]:
+        """Where some rays end: number of the ray in `row`, column and units of light.
+
+        `all_detour`: each of them is known to meet a surface that does not simply reflect.
+        """
         n = len(row)
         origins, directions = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         counter = np.empty(n, np.int32)
@@ -213,7 +219,12 @@ class RowBuilder:
             directions,
             counter,
         )
-        cell, weight = self._cells(origins, directions, counter, rays.seed)
+        cell: I32
+        weight: F32 | None
+        if all_detour:
+            cell, weight = self._cells_behind(origins, directions, counter, rays.seed)
+        else:
+            cell, weight = self._cells(origins, directions, counter, rays.seed)
         which = np.flatnonzero(cell >= 0)
         units = np.full(n, _UNITS) if weight is None else np.rint(weight * np.float32(_UNITS)).astype(np.int64)
         column, units = cell[which].astype(np.int64), units[which]
@@ -316,13 +327,15 @@ class RowBuilder:
         rest = np.flatnonzero(detour)
         if not len(rest):
             return cell, None
-        ends = first_surfaces(
-            self._snapshot, self._tracer, origins[rest], directions[rest], seed, _DETOUR_DEPTH, counters[rest]
-        )
-        cell[rest] = self._gather.locate(ends.points)
         weight = np.ones(len(cell), np.float32)
-        weight[rest] = ends.throughput.mean(axis=1)
+        cell[rest], weight[rest] = self._cells_behind(origins[rest], directions[rest], counters[rest], seed)
         return cell, weight
+
+    def _cells_behind(self, origins: F32, directions: F32, counters: I32, seed: int) -> tuple[I32, F32]:
+        """Cell at the end of each path over mirrors, glass and holes, and the path's throughput."""
+        ends = first_surfaces(self._snapshot, self._tracer, origins, directions, seed, _DETOUR_DEPTH, counters)
+        red, green, blue = ends.throughput.T
+        return self._gather.locate(ends.points), (red + green + blue) / np.float32(3)
 
     def _merge(self, cell: I32, weight: F32, n_rays: int) -> tuple[SparseRows, F32]:
         """Rows of the first column of `weight` (n, k), and the last column's weights of the same entries."""
