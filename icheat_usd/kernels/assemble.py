@@ -210,10 +210,18 @@ def _replace_run(first, n, own_view, own, touched, sent):  # type: ignore[no-unt
             sent[v - first, c] = own[v, c]
     if len(touched) == 0:
         return
+    n_touched = 0
     for i in range(n):
-        if touched[first + i]:
-            for c in range(3):
-                sent[i, c] = max(sent[i, c], np.float32(0.0))
+        n_touched += touched[first + i]
+    if n_touched == n:
+        values = sent.reshape(-1)
+        for i in range(3 * n):
+            values[i] = values[i] if values[i] > 0 else np.float32(0.0)
+    elif n_touched > 0:
+        for i in range(n):
+            if touched[first + i]:
+                for c in range(3):
+                    sent[i, c] = sent[i, c] if sent[i, c] > 0 else np.float32(0.0)
 
 
 @kernel
@@ -232,6 +240,7 @@ def _sent_run(  # type: ignore[no-untyped-def]
     touched,
     direct,
     gains,
+    dimmed_view,
     throughput,
     sent,
 ):
@@ -245,8 +254,9 @@ def _sent_run(  # type: ignore[no-untyped-def]
             gain[i] = gains[light, i % 3]
         place = address_of(direct) + 12 * (light * direct.shape[1] + first)
         _add_scaled_run(n, place, address_of(gain), out)
-    if len(throughput) > 0:
-        _multiply_run(n, out, address_of(throughput) + 12 * first, out)
+    for k in range(np.searchsorted(dimmed_view, first), np.searchsorted(dimmed_view, first + n)):
+        for c in range(3):
+            sent[dimmed_view[k] - first, c] *= throughput[k, c]
     gain[0] = np.float32(0.0)  # keeps it, see `_indirect_run`
 
 
@@ -305,9 +315,10 @@ def _film_chunk(  # type: ignore[no-untyped-def]
     touched,
     direct,
     gains,
+    dimmed_view,
     throughput,
     sample_begin,
-    pixel,
+    in_order,
     still_pixel,
     still,
     film,
@@ -315,8 +326,6 @@ def _film_chunk(  # type: ignore[no-untyped-def]
     base = address_of(film)
     first = np.int64(sample_begin[begin])
     n = np.int64(sample_begin[end]) - first
-    # As many samples as pixels, and none with two: they are the pixels.
-    in_order = len(throughput) == 0 and n == end - begin
     sent = film[begin:end] if in_order else np.empty((n, 3), np.float32)
     _sent_run(
         first,
@@ -333,6 +342,7 @@ def _film_chunk(  # type: ignore[no-untyped-def]
         touched,
         direct,
         gains,
+        dimmed_view,
         throughput,
         sent,
     )
@@ -342,6 +352,12 @@ def _film_chunk(  # type: ignore[no-untyped-def]
     for s in range(np.searchsorted(still_pixel, begin), np.searchsorted(still_pixel, end)):
         place = base + 12 * np.int64(still_pixel[s])
         store_rgb(place, scale_add(load_rgb(address_of(still) + 12 * s), np.float32(1.0), load_rgb(place)))
+
+
+def chunks_in_order(sample_begin: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """In which of the pieces that `assemble_film` makes of an image each pixel has one view sample."""
+    single = np.diff(sample_begin) == 1
+    return np.array([single[first : first + _CHUNK].all() for first in range(0, len(single), _CHUNK)], np.bool_)
 
 
 @parallel_kernel
@@ -358,9 +374,10 @@ def assemble_film(  # type: ignore[no-untyped-def]
     touched,
     direct,
     gains,
+    dimmed_view,
     throughput,
     sample_begin,
-    pixel,
+    in_order,
     still_pixel,
     still,
     film,
@@ -378,12 +395,13 @@ def assemble_film(  # type: ignore[no-untyped-def]
     direct : (n_lights, n_view, 3) float32
         Reflected direct light of each light at gain 1.
     gains : (n_lights, 3) float32
-    throughput : (n_view, 3) or (0, 3) float32
-        Of the view samples; without rows all are 1 and no pixel has more than one sample.
+    dimmed_view : (n_dimmed,) int32
+        View samples, ascending, whose throughput is not 1.
+    throughput : (n_dimmed, 3) float32
     sample_begin : (n_pixels + 1,) int32
         First view sample of each pixel.
-    pixel : (n_view,) int32
-        Of the view samples, ascending.
+    in_order : (n_chunks,) bool
+        Of `chunks_in_order`.
     still_pixel : (n_still,) int32
         Pixels that emit or show the background, ascending, each once.
     still : (n_still, 3) float32
@@ -411,9 +429,10 @@ def assemble_film(  # type: ignore[no-untyped-def]
             touched,
             direct,
             gains,
+            dimmed_view,
             throughput,
             sample_begin,
-            pixel,
+            in_order[chunk],
             still_pixel,
             still,
             film,

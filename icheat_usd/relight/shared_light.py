@@ -7,7 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
-from icheat_usd.kernels.assemble import InterpolationTable, assemble_film, assemble_view, interpolation_table
+from icheat_usd.kernels.assemble import (
+    InterpolationTable,
+    assemble_film,
+    assemble_view,
+    chunks_in_order,
+    interpolation_table,
+)
 from icheat_usd.relight.groups import SampleGroups, TermTable
 from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.products import Products
@@ -29,9 +35,10 @@ class OwnLight(NamedTuple):
 class SeenSamples(NamedTuple):
     """How view samples make pixels; see `assemble_film`."""
 
-    throughput: F32
+    dimmed: I32  #: ascending
+    throughput: F32  #: (n_dimmed, 3)
     sample_begin: I32
-    pixel: I32
+    in_order: Bool
     still_pixel: I32
     still: F32
 
@@ -41,10 +48,9 @@ def seen_samples(view: ViewSamples) -> SeenSamples:
     begin = np.searchsorted(view.pixel, np.arange(view.width * view.height + 1)).astype(np.int32)
     still = (view.background + develop(view, view.points.emission)).astype(np.float32)
     shown = np.flatnonzero(still.any(axis=1)).astype(np.int32)
-    plain = bool((view.throughput == 1).all()) and np.diff(begin).max(initial=0) <= 1
-    throughput = np.zeros((0, 3), np.float32) if plain else np.ascontiguousarray(view.throughput, np.float32)
-    pixel = np.ascontiguousarray(view.pixel, np.int32)
-    return SeenSamples(throughput, begin, pixel, shown, np.ascontiguousarray(still[shown]))
+    dimmed = np.flatnonzero((view.throughput != 1).any(axis=1)).astype(np.int32)
+    throughput = np.ascontiguousarray(view.throughput[dimmed], np.float32)
+    return SeenSamples(dimmed, throughput, begin, chunks_in_order(begin), shown, np.ascontiguousarray(still[shown]))
 
 
 class SharedLight:

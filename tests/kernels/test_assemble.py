@@ -10,6 +10,7 @@ from icheat_usd.kernels.assemble import (
     InterpolationTable,
     assemble_film,
     assemble_view,
+    chunks_in_order,
     interpolation_table,
     sum_scaled,
 )
@@ -59,12 +60,16 @@ def test_view_samples_are_interpolated_and_tinted() -> None:
 def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
     rng = np.random.default_rng(3)
     n_pixels = 4500
-    per_pixel = np.ones(n_pixels, np.int64) if samples == "one" else rng.integers(0, 4, n_pixels)
+    per_pixel = np.ones(n_pixels, np.int64)
+    if samples == "varied":
+        per_pixel[1024:] = rng.integers(0, 4, n_pixels - 1024)
     pixel = np.repeat(np.arange(n_pixels), per_pixel).astype(np.int32)
     n = len(pixel)
     rows = interpolation(rng.integers(1, 9, n).astype(np.int32))
     products, tint, direct, gains = colors(1, N_ROWS, 4), colors(1, n, 3), colors(2, n, 3), colors(2, 3)
-    throughput = colors(n, 3) if samples == "varied" else np.ones((0, 3), np.float32)
+    dimmed_view = np.sort(rng.choice(n, 0 if samples == "one" else 1500, replace=False)).astype(np.int32)
+    throughput = np.ones((n, 3), np.float32)
+    throughput[dimmed_view] = colors(len(dimmed_view), 3)
     still_pixel = np.sort(rng.choice(n_pixels, 100, replace=False)).astype(np.int32)
     still = colors(100, 3)
     begin = np.concatenate([[0], np.cumsum(per_pixel)]).astype(np.int32)
@@ -76,7 +81,7 @@ def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
     indirect[touched] = np.maximum(indirect[touched], 0)
     sent = indirect + (gains[:, None].astype(np.float64) * direct).sum(axis=0)
     expected = np.zeros((n_pixels, 3))
-    np.add.at(expected, pixel, sent * (throughput if len(throughput) else 1))
+    np.add.at(expected, pixel, sent * throughput)
     expected[still_pixel] += still
     films = []
     before = numba.get_num_threads()
@@ -85,7 +90,7 @@ def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
             numba.set_num_threads(n_threads)
             film = np.full((n_pixels, 3), np.nan, np.float32)
             edited = (own_view, own, touched)
-            seen = (throughput, begin, pixel, still_pixel, still)
+            seen = (dimmed_view, throughput[dimmed_view], begin, chunks_in_order(begin), still_pixel, still)
             assemble_film(*table_of(rows), products, tint, *edited, direct, gains, *seen, film)
             films.append(film)
     finally:

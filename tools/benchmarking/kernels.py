@@ -20,7 +20,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from icheat_usd.kernels.assemble import assemble_film, interpolation_table
+from icheat_usd.kernels.assemble import assemble_film, chunks_in_order, interpolation_table
 from icheat_usd.kernels.packed import LANES, PairedTiles, multiply_paired_tiles, multiply_tiles, pair_coefficients
 from icheat_usd.kernels.simd import address_of, load, multiply_add, spread, store, zeros
 from icheat_usd.samples import ViewSamples
@@ -325,13 +325,12 @@ def measure_frame(
     gains = np.ones((len(direct), 3), np.float32)
     n_pixels = view.width * view.height
     sample_begin = np.searchsorted(view.pixel, np.arange(n_pixels + 1)).astype(np.int32)
-    plain = bool(np.all(view.throughput == 1)) and np.diff(sample_begin).max(initial=0) <= 1
-    throughput = view.throughput[:0] if plain else view.throughput
+    dimmed = np.flatnonzero((view.throughput != 1).any(axis=1)).astype(np.int32)
     still = np.flatnonzero(view.background.any(axis=1)).astype(np.int32)
     background = np.ascontiguousarray(view.background[still])
     film = np.empty((n_pixels, 3), np.float32)
     unedited = (np.zeros(0, np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.bool_))
-    seen = (throughput, sample_begin, view.pixel, still, background)
+    seen = (dimmed, view.throughput[dimmed], sample_begin, chunks_in_order(sample_begin), still, background)
 
     def haar() -> None:
         haar_of_versions(plan, values, products[0].coefficients)
@@ -358,7 +357,7 @@ def measure_frame(
         "pixels": sum(column.nbytes for column in table)
         + tint.nbytes
         + direct.nbytes
-        + throughput.nbytes
+        + view.throughput[dimmed].nbytes
         + film.nbytes,
     }
     contenders: dict[tuple[str, int], tuple[Work, int]] = {}
