@@ -1,7 +1,7 @@
 """Direct light of one light at many places, at interactive rates: sampled, shadowed and summed in one pass.
 
-The light is a table of points spread evenly over its surface. Every place looks at four of them, sends a shadow
-ray to one, chosen in proportion to what each would bring, and counts the mean of the four for it (resampled
+The light is a table of points spread evenly over its surface. Every place looks at some of them, sends a shadow
+ray to one, chosen in proportion to what each would bring, and counts the mean of all for it (resampled
 importance sampling [1]_ over strata): unbiased over the choice of points, and without most of the noise that
 distance and cosines of a single point would have.
 
@@ -21,6 +21,7 @@ from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
 
 RUN = 64  #: successive places that share shadow rays if that is allowed
 CANDIDATES = 4  #: points of the light that a place looks at
+_QUICK_CANDIDATES = 2  # where places share rays
 _RUNS = 16  # of a task
 _INVALID = np.uint32(0xFFFFFFFF)
 _STOP_SHORT = np.float32(1.0 - 1e-4)  # as for other shadow rays: lights may lie in the plane of a ceiling
@@ -50,37 +51,37 @@ def _brings(
 
 @kernel
 def _choose(
-    table: np.ndarray, distant: bool, place: np.ndarray, i: int, weight: np.ndarray, seed: int, turn: int
-) -> tuple[int, float]:
+    table: np.ndarray, distant: bool, place: np.ndarray, i: int, candidates: int, weight: np.ndarray,
+    of_run: int, of_turn: int, turn: int,
+) -> tuple[int, float]:  # fmt: skip
     """Point of the light that place `i` sends its ray to (-1: none), and the mean of what its candidates bring."""
     x, y, z = place[i, 0], place[i, 1], place[i, 2]
     gx, gy, gz = place[i, 3], place[i, 4], place[i, 5]
     nx, ny, nz = place[i, 6], place[i, 7], place[i, 8]
     # neighbours look at different points, those of a run at all of them, and so does one place in as many turns
-    groups = len(table) // CANDIDATES
-    word = np.int64(hash_u32(np.uint32(i // RUN) ^ np.uint32(seed)))
-    first = (((i % RUN) * 29 + word) % groups ^ turn % groups) * CANDIDATES
+    groups = len(table) // candidates
+    first = ((((i & (RUN - 1)) * 29 + of_run) ^ turn) & (groups - 1)) * candidates
     total = _ZERO
-    for c in range(CANDIDATES):
+    for c in range(candidates):
         weight[c] = _brings(table, first + c, distant, x, y, z, nx, ny, nz, gx, gy, gz)
         total += weight[c]
     if not total > _ZERO:
         return -1, _ZERO
-    left = to_unit(hash_combine(hash_combine(seed, turn), i)) * total
+    left = to_unit(hash_u32(np.uint32(of_turn) ^ np.uint32(i))) * total
     last = -1
-    for c in range(CANDIDATES):
+    for c in range(candidates):
         if weight[c] > _ZERO:
             last = c
             if left < weight[c]:
                 break
             left -= weight[c]
-    return first + last, total / np.float32(CANDIDATES)
+    return first + last, total / np.float32(candidates)
 
 
 @kernel
 def _trace(
-    function: int, opaque: int, passing: int, table: np.ndarray, distant: bool, place: np.ndarray, first: int,
-    rows: np.ndarray, n: int, chosen: np.ndarray, valid: np.ndarray, rays: np.ndarray, state: np.ndarray,
+    function: int, arguments: int, opaque: int, passing: int, table: np.ndarray, distant: bool, place: np.ndarray,
+    first: int, rows: np.ndarray, n: int, chosen: np.ndarray, valid: np.ndarray, rays: np.ndarray, state: np.ndarray,
 ) -> None:  # fmt: skip
     """Shadow rays of `n` places of a run, in packets of 16."""
     words = rays.view(np.uint32)
@@ -99,14 +100,14 @@ def _trace(
             words[9, lane] = _INVALID
             words[10, lane] = 0
             words[11, lane] = 0
-        call_packet(function, valid.ctypes.data, opaque, rays.ctypes.data, 0)
+        call_packet(function, valid.ctypes.data, opaque, rays.ctypes.data, arguments)
         for lane in range(count):
             state[rows[begin + lane]] = _CLEAR if rays[8, lane] >= _ZERO else _BLOCKED
         if passing == 0:
             continue
         for lane in range(count):
             valid[lane] = -1 if rays[8, lane] >= _ZERO else 0
-        call_packet(function, valid.ctypes.data, passing, rays.ctypes.data, 0)
+        call_packet(function, valid.ctypes.data, passing, rays.ctypes.data, arguments)
         for lane in range(count):
             if valid[lane] != 0 and rays[8, lane] < _ZERO:
                 state[rows[begin + lane]] = _THROUGH
@@ -145,6 +146,7 @@ def _gloss(
 @parallel_kernel
 def light_places(
     function: int,
+    arguments: int,
     opaque: int,
     passing: int,
     table: np.ndarray,
@@ -165,6 +167,7 @@ def light_places(
     ----------
     function, opaque, passing : addresses of rtcOccluded16 and of the scenes of opaque and of see-through triangles
         (0: there are none)
+    arguments : address of RTCOccludedArguments, or 0
     table : (m, 12) float32
         Points of the light: place, normal, colour, radiance times the whole light's area. Distant lights:
         directions, and radiance times solid angle. m is a power of two and a multiple of
@@ -179,6 +182,7 @@ def light_places(
         eye; or no rows: no place has a lobe.
     share_rays : bool
         Rays of a quarter of the places stand for a whole run where all agree: for places in the order of tiles.
+        Shadows that fall between those rays are missed. Such places look at two points only.
     row : (n,) int32
         Row of `out` that each place has, all different.
     out : (n, 3) float32, set
@@ -195,21 +199,29 @@ def light_places(
         valid = storage[shift : shift + 16].view(np.int32)
         rays = storage[shift + 16 : shift + 16 + 12 * 16].reshape(12, 16)
         weight = np.empty(CANDIDATES, np.float32)
+        of_turn = np.int64(hash_combine(seed, turn))
+        candidates = _QUICK_CANDIDATES if share_rays else CANDIDATES
         rows = np.empty(RUN, np.int64)
         chosen = np.empty(RUN, np.int64)
         state = np.empty(RUN, np.int64)
         level = np.empty(RUN, np.float32)
         for first in range(task * task_size, min(n, (task + 1) * task_size), RUN):
             size = min(RUN, n - first)
+            of_run = np.int64(hash_u32(np.uint32(first // RUN) ^ np.uint32(seed)))
             for j in range(size):
-                chosen[j], level[j] = _choose(table, distant, place, first + j, weight, seed, turn)
+                chosen[j], level[j] = _choose(
+                    table, distant, place, first + j, candidates, weight, of_run, of_turn, turn
+                )
                 state[j] = _BLOCKED
             count = 0
             for j in range(size):
                 if chosen[j] >= 0 and (not share_rays or j % 4 == 0):
                     rows[count] = j
                     count += 1
-            _trace(function, opaque, passing, table, distant, place, first, rows, count, chosen, valid, rays, state)
+            _trace(
+                function, arguments, opaque, passing, table, distant, place, first, rows, count, chosen, valid, rays,
+                state,
+            )  # fmt: skip
             if share_rays:
                 common = state[rows[0]] if count >= RUN // 8 else _THROUGH
                 for q in range(count):
@@ -222,8 +234,9 @@ def light_places(
                         count += 1
                 if common == _THROUGH:
                     _trace(
-                        function, opaque, passing, table, distant, place, first, rows, count, chosen, valid, rays, state
-                    )
+                        function, arguments, opaque, passing, table, distant, place, first, rows, count, chosen, valid,
+                        rays, state,
+                    )  # fmt: skip
             for j in range(size):
                 i, k = first + j, chosen[j]
                 target = np.int64(row[i])

@@ -122,7 +122,10 @@ def direct_at(
     function, opaque = shadows.opaque.address_of("rtcOccluded16")
     passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
     tables = places.place, places.tint, places.gloss
-    light_places(function, opaque, passing, table, distant, seed, turn, *tables, share_rays, places.row, out, through)
+    similar = shadows.opaque.compiled().arguments if share_rays else 0
+    light_places(
+        function, similar, opaque, passing, table, distant, seed, turn, *tables, share_rays, places.row, out, through
+    )
     if shadows.passing is not None:
         rows = np.flatnonzero(through)
         origin, end = places.place[rows, :3], table[through[rows] - 1, :3]
