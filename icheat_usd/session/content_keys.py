@@ -76,7 +76,7 @@ def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKey
 def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     """All settings but those that other keys hold, or that come after the transport."""
     elsewhere = {"n_gather", "rays_per_bounce_row", "light_samples", "dome_samples", "n_bounces", "samples_per_pixel"}
-    unused = {"record_rays"} if quality.record_error is None else {"rays_per_row", "row_spacing"}
+    unused = {"record_rays"} if quality.record_error is None else {"rays_per_row", "row_spacing", "shared_rays"}
     without = elsewhere | unused | {"packing_error"}
     return tuple((name, value) for name, value in asdict(quality).items() if name not in without)
 

@@ -18,6 +18,7 @@ class Quality:
     rays_per_row: int = 256
     rays_per_bounce_row: int = 128
     row_spacing: int = 1  #: pixels between the points where rows are kept; the rest is interpolated
+    shared_rays: bool = False  #: the same rays from all of these: a smooth shade instead of noise
     record_error: float | None = None  #: relative RMS error that rows kept where they are needed, instead of on a grid,
     #: may add by interpolation; None keeps them on the grid of `row_spacing`
     record_rays: int = 2048  #: gather rays of each such row
@@ -53,6 +54,7 @@ def coarse(quality: Quality) -> Quality:
         rays_per_row=min(quality.rays_per_row, 64),
         rays_per_bounce_row=min(quality.rays_per_bounce_row, 16),
         row_spacing=max(quality.row_spacing, 8),
+        shared_rays=True,
         record_error=None,
         packing_error=None,
         light_samples=min(quality.light_samples, 2),

@@ -162,6 +162,7 @@ class ShotParts:
                 self.gather,
                 rays_per_row=quality.rays_per_row,
                 row_spacing=quality.row_spacing,
+                shared_rays=quality.shared_rays,
                 seed=quality.seed,
                 progress=self.progress,
             )

@@ -69,6 +69,7 @@ def build_transport(
     *,
     rays_per_row: int = 256,
     row_spacing: int = 1,
+    shared_rays: bool = False,
     seed: int = 0,
     progress: Progress = silent,
 ) -> Transport:
@@ -87,6 +88,8 @@ def build_transport(
         1 computes a row at every view sample. Larger values compute rows on a
         pixel grid of this spacing (and wherever no row nearby fits) and
         interpolate between them.
+    shared_rays
+        One sequence of rays for all rows: what is noise else is then a shade that moves slowly over a surface.
 
     Notes
     -----
@@ -98,9 +101,10 @@ def build_transport(
         row_view, interpolation = sparse_rows_of_view(view, snapshot.camera, row_spacing)
     builder = RowBuilder(snapshot, tracer, gather, seed)
 
-    stream = row_view.astype(np.int64)
+    numbers = row_view.astype(np.int64)
+    stream = np.zeros_like(numbers) if shared_rays else numbers
     one_each = np.arange(len(row_view) + 1, dtype=np.int64)
-    points = take_points(view.points, stream)
+    points = take_points(view.points, numbers)
     diffuse = builder.diffuse_rows(points, one_each, stream, rays_per_row, 0, progress, "gather rays")
     lobes = [Lobe("diffuse", diffuse, view.points.albedo)]
 
@@ -110,4 +114,4 @@ def build_transport(
         lobes.append(Lobe("specular_base", base, view.points.specular))
         lobes.append(Lobe("specular_edge", edge, view.points.specular_edge))
 
-    return Transport(tuple(lobes), row_view, interpolation, rays_per_row, seed)
+    return Transport(tuple(lobes), row_view, interpolation, rays_per_row, seed, stream if shared_rays else None)
