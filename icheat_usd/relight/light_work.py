@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -20,7 +21,8 @@ from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.tracing.embree import EmbreeTracer
-from icheat_usd.transport import Bounces, solve_bounces
+from icheat_usd.transport import Bounces
+from icheat_usd.transport.bounces import bounce_by_bounce
 from icheat_usd.transport.quick_bounces import QuickBounces, build_quick_bounces
 from icheat_usd.transport.sparse import SparseRows
 
@@ -32,8 +34,8 @@ _RAYS_PER_STEP = 1 << 16  # of the general way
 # Rays to the sky of each patch point and view sample, for domes on the move.
 _SKY_OF_CELLS, _SKY_OF_VIEW = 2, 8
 
-# The same of each sample of a `SparseView`.
-_SKY_OF_FEW = 16
+# The same where the view is sparse, of few cells and few samples.
+_SKY_OF_FEW_CELLS, _SKY_OF_FEW = 6, 48
 
 
 class SparseView(NamedTuple):
@@ -72,12 +74,11 @@ class Surroundings:
             gather, view = self.gather, self.view
             effort = None if self.sparse is None else LITTLE
             even, sampler = white_sky(self.snapshot, self.tracer, gather.patch_points, self.seed, effort)
+            n_of_cells = _SKY_OF_CELLS if self.sparse is None else _SKY_OF_FEW_CELLS
             ways = (even, sampler, self.shadows)
             tint = self.cell_means(self.patch_tint)
             view_tint = view.points.albedo / np.float32(np.pi)
-            self._sky.append(
-                see_sky(*ways, gather.patch_points, tint, None, _SKY_OF_CELLS, self.seed, gather.cell_begin)
-            )
+            self._sky.append(see_sky(*ways, gather.patch_points, tint, None, n_of_cells, self.seed, gather.cell_begin))
             if self.sparse is None:
                 self._sky.append(see_sky(*ways, view.points, view_tint, view.to_eye, _SKY_OF_VIEW, self.seed + 1))
             else:
@@ -161,6 +162,25 @@ def _tile_order(view: ViewSamples) -> I64:
     return np.argsort(key, kind="stable")
 
 
+class ExactBounces:
+    """The bounces of one light as `solve_bounces` has them, one per step."""
+
+    def __init__(self, around: Surroundings, direct: F32) -> None:
+        self._bounces: Iterator[F32] | None = bounce_by_bounce(around.bounces, direct, around.n_bounces)
+        self._radiance = direct
+
+    def step(self, radiance: F32) -> bool:
+        """Another bounce; False once all are done, and in `radiance`."""
+        if self._bounces is not None:
+            found = next(self._bounces, None)
+            if found is not None:
+                self._radiance = found
+                return True
+            radiance[:] = self._radiance
+            self._bounces = None
+        return False
+
+
 class MovingLight:
     """A light with a surface of its own, or a distant one: rounds of one shadow ray per patch point and view sample."""
 
@@ -168,7 +188,8 @@ class MovingLight:
         self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
     ) -> None:
         self._around, self._alone, self._seed, self._rounds = around, alone, seed, light_samples
-        self._step = 0
+        self._step = self._n_found = 0
+        self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self._cells = np.zeros((around.gather.n, 3), np.float32)
         self._view = np.zeros((around.view.n, 3), np.float32)
@@ -189,11 +210,13 @@ class MovingLight:
         assert around.shadows is not None and around.patches is not None and around.tiles is not None
         turn, at_view = divmod(self._step, 2)
         self._step += 1
-        if turn == self._rounds:
-            self.direct = self._cells / np.float32(turn)
-            radiance[:] = solve_bounces(around.bounces, self.direct[None], around.n_bounces)[0]
-            self._find_highlights(view_direct)
-            return False
+        if turn >= self._rounds:
+            direct = self._cells / np.float32(self._rounds)
+            self._exact = self._exact or ExactBounces(around, direct)
+            if self._exact.step(radiance):
+                return True
+            self.direct = direct
+            return self._find_highlights(view_direct)
         places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
         found = np.empty((len(places.place), 3), np.float32)
         direct_at(self._alone, around.shadows, places, self._seed, False, found, turn)
@@ -207,14 +230,19 @@ class MovingLight:
             self.direct = direct
         return True
 
-    def _find_highlights(self, view_direct: F32) -> None:
-        view, rows = self._around.view, self._around.smooth
+    def _find_highlights(self, view_direct: F32) -> bool:
+        """Narrow lobes of some more view samples; False after the last."""
+        view, first = self._around.view, self._n_found
+        rows = self._around.smooth[first : first + max(1, _RAYS_PER_STEP // self._rounds)]
         if len(rows):
             points = take_points(view.points, rows)
             sampler = build_light_sampler(self._alone)
+            seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
             view_direct[rows] = reflected_direct(
-                self._alone, self._around.tracer, sampler, points, view.to_eye[rows], self._seed, self._rounds
+                self._alone, self._around.tracer, sampler, points, view.to_eye[rows], seed, self._rounds
             )[0]
+        self._n_found += len(rows)
+        return self._n_found < len(self._around.smooth)
 
 
 class AnyLight:
@@ -228,6 +256,7 @@ class AnyLight:
         self._n_view = samples_per_light(alone, light_samples, dome_samples)[0]
         self._samplers: list[LightSampler] = []
         self._cell = self._sample = 0
+        self._exact: ExactBounces | None = None
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self._cells = np.zeros((around.gather.n, 3), np.float32)
@@ -260,10 +289,11 @@ class AnyLight:
         around = self._around
         if self._cell < around.gather.n:
             self._light_cells()
-            if self._cell == around.gather.n:
-                self.direct = self._cells
-                radiance[:] = solve_bounces(around.bounces, self._cells[None], around.n_bounces)[0]
             return True
+        self._exact = self._exact or ExactBounces(around, self._cells)
+        if self._exact.step(radiance):
+            return True
+        self.direct = self._cells
         if self._sample < around.view.n:
             self._light_view()
         if self._sample < around.view.n:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,13 +116,20 @@ def solve_bounces(bounces: Bounces, direct: F32, n_bounces: int) -> F32:
         raise ValueError(f"direct light of shape {direct.shape} for {bounces.rows.n_rows} gather cells")
     out = direct.astype(np.float32, copy=True)
     for light in range(len(direct)):
-        last = direct[light]
-        for _ in range(n_bounces - 1):
-            last = bounces.albedo * bounces.rows.matmul(last)
-            out[light] += last
-            if np.abs(last).sum(dtype=np.float64) <= _CONVERGED * np.abs(out[light]).sum(dtype=np.float64):
-                break
+        for radiance in bounce_by_bounce(bounces, direct[light], n_bounces):
+            out[light] = radiance
     return out
+
+
+def bounce_by_bounce(bounces: Bounces, direct: F32, n_bounces: int) -> Iterator[F32]:
+    """The steps of `solve_bounces` for one light (n_gather, 3): the same array after each bounce, until it is done."""
+    out, last = direct.astype(np.float32, copy=True), direct
+    for _ in range(n_bounces - 1):
+        last = bounces.albedo * bounces.rows.matmul(last)
+        out += last
+        yield out
+        if np.abs(last).sum(dtype=np.float64) <= _CONVERGED * np.abs(out).sum(dtype=np.float64):
+            break
 
 
 def light_cells(
