@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport.build import Lobe, Transport
+from icheat_usd.transport.outliers import Survey, add_outliers
 from icheat_usd.transport.pieces import PartStore, Pieces
 from icheat_usd.transport.rays import MeasuredRows, RowBuilder
 from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
@@ -20,6 +22,10 @@ from icheat_usd.transport.sparse import SparseRows, concatenate_rows
 
 #: Rays of a row while records are placed. All rows have the same, so that neighbours differ by what they see.
 _PLACING_RAYS = 256
+#: The same for every view sample, when outliers are looked for.
+_SURVEY_RAYS = 64
+_STRONG = 0.2  # reflectance: what reflects less follows from its neighbours, or is not missed
+_SURVEYED_AT_ONCE = 1 << 15  # samples, whose rows are held in memory
 _GROWTH = 4  # of the rays from one transport to the next
 _LOBES = ("diffuse", "specular_base", "specular_edge")
 
@@ -69,27 +75,50 @@ def build_transports(
     placed: list[list[SparseRows]] = [[], [], []]
     pieces = Pieces(parts)
 
+    def trace(samples: I64, stream: I64, first_ray: int, n_rays: int, of_rays: int) -> MeasuredRows:
+        points = take_points(view.points, samples)
+        one_each = np.arange(len(samples) + 1, dtype=np.int64)
+        return builder.measure(
+            points, one_each, stream, n_rays, 0, progress, "gather rays", first_ray=first_ray, of_rays=of_rays
+        )
+
+    def trace_specular(samples: I64, stream: I64, n_rays: int) -> tuple[SparseRows, SparseRows]:
+        points = take_points(view.points, samples)
+        glossy = np.flatnonzero(is_glossy(points))
+        if not len(glossy):
+            nothing = SparseRows.empty(len(samples), gather.n)
+            return nothing, nothing
+        return builder.specular_rows(points, view.to_eye[samples], stream, glossy, n_rays, progress)
+
     def rows_of(samples: I64, stream: I64, first_ray: int, n_rays: int, of_rays: int) -> MeasuredRows:
         def make(rows: I64) -> MeasuredRows:
-            points = take_points(view.points, samples[rows])
-            one_each = np.arange(len(rows) + 1, dtype=np.int64)
-            step = "gather rays"
-            return builder.measure(
-                points, one_each, stream[rows], n_rays, 0, progress, step, first_ray=first_ray, of_rays=of_rays
-            )
+            return trace(samples[rows], stream[rows], first_ray, n_rays, of_rays)
 
         return pieces.measured(np.arange(len(samples)), n_rays, make)
 
     def specular(samples: I64, stream: I64, n_rays: int) -> list[SparseRows]:
         def make(rows: I64) -> tuple[SparseRows, SparseRows]:
-            points = take_points(view.points, samples[rows])
-            glossy = np.flatnonzero(is_glossy(points))
-            if not len(glossy):
-                nothing = SparseRows.empty(len(rows), gather.n)
-                return nothing, nothing
-            return builder.specular_rows(points, view.to_eye[samples[rows]], stream[rows], glossy, n_rays, progress)
+            return trace_specular(samples[rows], stream[rows], n_rays)
 
         return list(pieces.both(np.arange(len(samples)), n_rays, make))
+
+    def look(samples: I64) -> F32:
+        """Diffuse light by few rays, in two halves: (n, 2, n_lights)."""
+        stream, half = np.zeros_like(samples), _SURVEY_RAYS // 2
+        parts = [trace(samples, stream, first, half, _SURVEY_RAYS).cells.matmul(lights) for first in (0, half)]
+        return np.stack(parts, axis=1)
+
+    def look_specular(samples: I64) -> F32:
+        both = trace_specular(samples, np.zeros_like(samples), _SURVEY_RAYS)
+        return np.stack([rows.matmul(lights) for rows in both], axis=1)
+
+    def survey() -> Survey:
+        """The light at every view sample."""
+        reflects = is_glossy(view.points) & (view.points.specular.max(axis=1) >= _STRONG)
+        glossy = np.flatnonzero(reflects)
+        diffuse = [pieces.get(partial(look, samples)) for samples in _chunks(np.arange(view.n))]
+        reflected = [pieces.get(partial(look_specular, samples)) for samples in _chunks(glossy)]
+        return Survey(np.concatenate(diffuse), glossy, np.concatenate(reflected))
 
     def probe(samples: I64) -> F32:
         out = np.zeros((2, 3, len(samples), lights.shape[1]), np.float32)
@@ -112,6 +141,7 @@ def build_transports(
         yield _transport(view, records, rows, _PLACING_RAYS, seed, np.zeros(len(records.view), np.int64))
     assert records is not None
     placed.clear()
+    records = add_outliers(records, survey(), tint, settings)
     samples = records.view.astype(np.int64)
     measured: MeasuredRows | None = None
     n_rays = min(rays_per_row, 2 * _PLACING_RAYS)
@@ -123,6 +153,10 @@ def build_transports(
         if n_rays == rays_per_row:
             return
         n_rays = min(rays_per_row, n_rays * _GROWTH)
+
+
+def _chunks(samples: I64) -> list[I64]:
+    return np.split(samples, range(_SURVEYED_AT_ONCE, len(samples), _SURVEYED_AT_ONCE))
 
 
 def _transport(

@@ -17,7 +17,7 @@ from icheat_usd.transport.sparse import SparseRows
 _BUCKET = 8  # pixels
 _LEAST_GAIN = 0.005  # of the number of records: blocks to divide for which another round of rays is worth its time
 _FAINT = 0.02  # of the light that arrives: what shows less, as reflections in glass do, gets no records of its own
-_FOR_BLOCKS = 0.9  # of the records: some are left for sheets that were found by no corner
+_FOR_BLOCKS = 0.57  # of the records: some are left for sheets that were found by no corner, and for outliers
 _MISFIT = 0.5  # of a sample comes from the corners of its block: with less, records beside them must be near
 _PRIOR = 0.02  # squared relative error where a sheet has no record of its own to tell, before any has
 #: What halving a block leaves of its squared error: a bend of the light 1/16, an edge 1/2.
@@ -40,7 +40,7 @@ class RecordSettings:
     """
 
     tolerance: float = 0.01  #: relative RMS error of the image that interpolation may add
-    max_share: float = 0.12  #: of the view samples: there are no more records, where there is a choice
+    max_share: float = 0.14  #: of the view samples: there are no more records, where there is a choice
     coarsest: int = 32  #: pixels, a power of two: side of the largest blocks
 
     def __post_init__(self) -> None:
@@ -58,6 +58,7 @@ class Records:
     interpolation: SparseRows  #: (n_view x n) rows sum to 1
     error: float  #: relative RMS error expected of the training lights; inf before the first test
     fit: F32  #: (n_view,) share of each sample that comes from the corners of its block
+    mesh: Mesh  #: what they were made from, which changes with the next
 
 
 class _Weights(NamedTuple):
@@ -68,7 +69,7 @@ class _Weights(NamedTuple):
     reach: F32  #: (n,) pixels to the nearest record, where `fit` is not 1
 
 
-class _Mesh:
+class Mesh:
     """The quadtree, its corners, and the records on and beside them."""
 
     def __init__(self, view: ViewSamples, camera: Camera, coarsest: int) -> None:
@@ -148,6 +149,10 @@ class _Mesh:
         )
         return _Weights(count, record, weight, fit, reach)
 
+    def interpolate(self, samples: I64) -> SparseRows:
+        """Records and weights of some samples; a sample with a record takes that alone."""
+        return _packed(self.weights(samples), len(self.record_view))
+
     def split(self, blocks: Bool) -> None:
         """Divide the marked blocks (a mask of pixels, whole blocks), and what balance asks for."""
         self.parent[:] = self.level
@@ -179,7 +184,7 @@ def place_records(
     Records
         Ever finer; those of one are the first of the next.
     """
-    mesh = _Mesh(view, camera, settings.coarsest)
+    mesh = Mesh(view, camera, settings.coarsest)
     most = int(settings.max_share * view.n)
     shown = tint.max(axis=0) > _FAINT
     table: Records | None = None
@@ -209,7 +214,9 @@ def place_records(
         chosen = np.zeros(mesh.level.size, bool)
         chosen[ranked] = True
         mesh.split(chosen[_block_of(mesh.level)])
-    if len(_add_orphans(mesh, most, shown, mesh.level.size)):
+    new = _add_orphans(mesh, most, shown, mesh.level.size)
+    if len(new):
+        probe(new)
         yield replace(_records(mesh), error=float(np.sqrt(share.sum())))
 
 
@@ -254,7 +261,7 @@ class _Tests:
         )
 
 
-def _expected(mesh: _Mesh, tests: _Tests, fit: F32, shown: Bool) -> F64:
+def _expected(mesh: Mesh, tests: _Tests, fit: F32, shown: Bool) -> F64:
     """Squared relative error expected of each block, as a share of the image: (n_pixels,), at the block's first pixel.
 
     Samples that their block's corners give and those beside them are judged
@@ -322,7 +329,7 @@ def _apply(interpolation: SparseRows, samples: I64, response: F32) -> F32:
     return out
 
 
-def _add_orphans(mesh: _Mesh, most: int, shown: Bool, divisions: int) -> I64:
+def _add_orphans(mesh: Mesh, most: int, shown: Bool, divisions: int) -> I64:
     """Give records to samples on sheets that have none near: (n,) the new ones.
 
     Near is half a block; on a grid of that spacing, and where the grid does
@@ -350,17 +357,21 @@ def _add_orphans(mesh: _Mesh, most: int, shown: Bool, divisions: int) -> I64:
     return np.concatenate(added)
 
 
-def _records(mesh: _Mesh) -> Records:
+def _records(mesh: Mesh) -> Records:
     found = mesh.weights(np.arange(mesh.view.n))
     left = np.flatnonzero(found.number == 0)
     if len(left):
         loose = mesh.weights(left, strict=False)
         found.number[left], found.record[left], found.weight[left] = loose.number, loose.record, loose.weight
+    rows = _packed(found, len(mesh.record_view))
+    return Records(mesh.record_view.astype(np.int32), rows, np.inf, found.fit, mesh)
+
+
+def _packed(found: _Weights, n_records: int) -> SparseRows:
     indptr = np.concatenate([[0], np.cumsum(found.number)]).astype(np.int64)
     indices, weights = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32)
     pack_rows(found.number, indptr, found.record, found.weight, indices, weights)
-    rows = SparseRows(indptr, indices, weights, len(mesh.record_view))
-    return Records(mesh.record_view.astype(np.int32), rows, np.inf, found.fit)
+    return SparseRows(indptr, indices, weights, n_records)
 
 
 def tile_order(position: F32, normal: F32, lanes: int = 64) -> I64:

@@ -139,3 +139,16 @@ def split_columns(rows: SparseRows, column: int) -> tuple[SparseRows, SparseRows
         kernels.copy_part(begin, first, rows.indices, rows.weights, part.indptr, part.indices, part.weights)
         parts.append(part)
     return parts[0], parts[1]
+
+
+def select_rows(base: SparseRows, other: SparseRows, rows: I64, of_other: I64) -> SparseRows:
+    """`base` with its `rows` replaced by the rows `of_other` of another matrix, whose width it gets."""
+    count = np.diff(base.indptr)
+    begin = base.indptr[:-1].copy()
+    count[rows] = np.diff(other.indptr)[of_other]
+    begin[rows] = base.n_entries + other.indptr[of_other]
+    indptr = np.concatenate([[0], np.cumsum(count)])
+    source = np.repeat(begin - indptr[:-1], count) + np.arange(indptr[-1])
+    indices = np.concatenate([base.indices, other.indices])[source]
+    weights = np.concatenate([base.weights, other.weights])[source]
+    return SparseRows(indptr, indices, weights, other.n_columns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from icheat_usd.samples import ViewSamples, view_samples
 from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import build_tracer
 from icheat_usd.transport import Transport, build_bounces
+from icheat_usd.transport.outliers import Survey, add_outliers
 from icheat_usd.transport.progressive import build_transports
 from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
 from icheat_usd.transport.training import training_radiance
@@ -154,9 +156,69 @@ def test_rows_of_records_are_those_of_the_plain_transport(room: tuple[Pipeline, 
         np.testing.assert_allclose(one.weights, other.weights, rtol=1e-6)
 
 
-def test_placement_is_repeatable(room: tuple[Pipeline, list[Transport]]) -> None:
+def test_placement_has_the_same_bits_for_any_number_of_threads() -> None:
     scene = floor_scene()
     view = view_of(scene)
-    one, two = (place(scene, linear(view), view, coarsest=8)[-1] for _ in range(2))
+    found = []
+    before = numba.get_num_threads()
+    try:
+        for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+            numba.set_num_threads(threads)
+            found.append(place(scene, linear(view), view, coarsest=8)[-1])
+    finally:
+        numba.set_num_threads(before)
+    one, two = found
     assert np.array_equal(one.view, two.view)
-    assert np.array_equal(one.interpolation.weights, two.interpolation.weights)
+    for name in ("indptr", "indices", "weights"):
+        assert np.array_equal(getattr(one.interpolation, name), getattr(two.interpolation, name))
+
+
+def test_a_thin_bright_bar_gets_records_of_its_own() -> None:
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
+    view = view_of(scene)
+    column = view.pixel % view.width
+    light = np.where(column == 21, 4.0, 0.3 + 0.2 * view.points.position[:, 0])[:, None].astype(np.float32)
+    records = place(scene, light, view, coarsest=16, tolerance=0.01, max_share=0.1)[0]
+    survey = Survey(np.stack([light, light], axis=1), np.empty(0, np.int64), np.empty((0, 2, 1), np.float32))
+    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    found = add_outliers(records, survey, tint, RecordSettings(tolerance=0.01, max_share=0.1))
+
+    def error(records: Records) -> float:
+        wrong = records.interpolation.matmul(light[records.view]) - light
+        return float(np.sqrt(np.mean(wrong**2) / np.mean(light**2)))
+
+    assert np.array_equal(found.view[: len(records.view)], records.view)
+    bar = np.flatnonzero(column == 21)
+    assert np.isin(bar, found.view).all() and len(found.view) < 0.1 * view.n
+    np.testing.assert_allclose(found.interpolation.row_sums(), 1, rtol=1e-5)
+    assert error(records) > 0.2 and error(found) < 0.01
+    assert found.error == pytest.approx(error(found), rel=0.05, abs=1e-4)
+
+
+def test_outliers_leave_noise_alone_and_keep_to_the_share() -> None:
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
+    view = view_of(scene)
+    rng = np.random.default_rng(0)
+    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    flat = np.ones((view.n, 8), np.float32)
+    records = place(scene, flat, view, coarsest=16)[-1]
+    start = len(records.view)
+    noisy = (flat[:, None] + 0.05 * rng.standard_normal((view.n, 2, 8))).astype(np.float32)
+    none = np.empty(0, np.int64), np.empty((0, 2, 8), np.float32)
+    quiet = add_outliers(records, Survey(noisy, *none), tint, RecordSettings(tolerance=0.02))
+    assert len(quiet.view) == start
+    rough = np.repeat(rng.random((view.n, 1, 8)).astype(np.float32), 2, axis=1)
+    full = add_outliers(records, Survey(rough, *none), tint, RecordSettings(max_share=0.2))
+    assert 0.19 * view.n < len(full.view) <= 0.2 * view.n
+
+
+def test_a_mirror_among_rough_samples_gets_its_own_reflection() -> None:
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=32, height=32))
+    view = view_of(scene)
+    flat = np.ones((view.n, 2, 1), np.float32)
+    records = place(scene, flat[:, 0], view, coarsest=16)[-1]
+    glossy = np.setdiff1d(np.arange(300, 304), records.view)
+    tint = np.ones((3, view.n), np.float32)
+    survey = Survey(flat, glossy, np.full((len(glossy), 2, 1), 5, np.float32))
+    found = add_outliers(records, survey, tint, RecordSettings(max_share=0.5))
+    assert np.isin(glossy, found.view).all()
