@@ -80,8 +80,10 @@ def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -
         "lights": {name: {} for name in names},
         "reference_seconds": time.perf_counter() - started,
     }
+    # All of them before any is brought to rest: what refining finds may stay for the lights that follow.
+    at_once = [parts.shown(light, at_rest=False) for light in range(len(names))]
     for light, name in enumerate(names):
-        found["lights"][name] = _of_light(parts, references, light)
+        found["lights"][name] = _of_light(parts, references, light, at_once[light])
         image = references.probe.to_pixels(parts.packed.to_view(just_made[light])[references.probe.samples])
         moving = relative_error(image, references.own_b[0][light], references.own_b[1][light])
         found["lights"][name]["while_moving"] = moving.as_dict()
@@ -118,13 +120,13 @@ def converged_references(parts: Parts, settings: ErrorSettings) -> References:
     return References(probe, (same[0], same[1]), (other[0], other[1]), (radiance[0], radiance[1]))
 
 
-def _of_light(parts: Parts, references: References, light: int) -> dict[str, Any]:
-    """Total error at frame rate, and where it comes from."""
+def _of_light(parts: Parts, references: References, light: int, at_once: F32) -> dict[str, Any]:
+    """Total error at frame rate, where it comes from, and what is left of it at rest; `at_once` is (n_view, 3)."""
     probe, b = references.probe, parts.lights.radiance[light]
     packed = probe.to_pixels(parts.packed.to_view(b)[probe.samples])
     shown = {
-        name: probe.to_pixels(parts.shown(light, at_rest=name == "at_rest")[probe.samples])
-        for name in ("total", "at_rest")
+        name: probe.to_pixels(image[probe.samples])
+        for name, image in (("total", at_once), ("at_rest", parts.shown(light, at_rest=True)))
     }
     found = {
         **{

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from icheat_usd.edits.model import EMPTY_STACK, EditStack
+from icheat_usd.edits.model import EditStack
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.samples import GatherSamples, ViewSamples
@@ -131,12 +131,13 @@ class Parts:
             pass
 
     def edit_change(self, stack: EditStack, gains: F32) -> F32:
-        """What a stack changes of the indirect light of every view sample, (n_view, 3)."""
+        """What a stack changes of the indirect light of every view sample at once, (n_view, 3)."""
         before = self.lights.gains.copy()
         self._set_gains(gains)
-        self.live.set_stack(stack)
-        lit = self.live.relit()
-        self.live.set_stack(EMPTY_STACK)
+        # One that was at rest before may know more of the lights than a frame does.
+        live = LiveRelighter(self.snapshot, self.view, self.gather, self.packed, self.lights)
+        live.set_stack(stack)
+        lit = live.relit()
         self._set_gains(before)
         return lit.indirect_edited - lit.indirect
 
