@@ -1,8 +1,8 @@
 """Products of quantised transport tiles with the light of gather cells, of the terms that are large in this light.
 
 Which coefficients of a tile matter depends on the light: many are there for
-lights at other places. Reading an index and a scale tells how large a term can
-be at most; the quanta of small ones are not read.
+lights at other places. An index and a worth tell how large a term is; the
+quanta of small ones are not read.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ _PARTS = 32
 
 
 @kernel
-def _find_large(begin, end, index, scale, size, least, number):  # type: ignore[no-untyped-def]
-    """Numbers of the coefficients whose terms can be `least` or more, and how many they are."""
+def _find_large(begin, end, index, worth, size, least, number):  # type: ignore[no-untyped-def]
+    """Numbers of the coefficients whose terms are `least` or more, and how many they are."""
     count = 0
-    indices, scales, sizes, numbers = address_of(index), address_of(scale), address_of(size), address_of(number)
+    indices, worths, sizes, numbers = address_of(index), address_of(worth), address_of(size), address_of(number)
     whole = begin + (end - begin) // 16 * 16
     for k in range(begin, whole, 16):
-        count += store_large(indices + 4 * k, scales + 4 * k, sizes, least, k, numbers + 4 * count)
+        count += store_large(indices + 4 * k, worths + 4 * k, sizes, least, k, numbers + 4 * count)
     for k in range(whole, end):
-        if size[index[k]] * scale[k] >= least:
+        if size[index[k]] * worth[k] >= least:
             number[count] = k
             count += 1
     return count
@@ -100,7 +100,7 @@ def _multiply_large(count, number, value, pairs, steps, out):  # type: ignore[no
 
 @kernel
 def _multiply_run(  # type: ignore[no-untyped-def]
-    tile_begin, index, scale, value, coefficients, size, least, pair_tile, pair_version, first, last, out
+    tile_begin, index, scale, worth, value, coefficients, size, least, pair_tile, pair_version, first, last, out
 ):
     """Pairs `first` to `last`."""
     most = 0
@@ -114,7 +114,7 @@ def _multiply_run(  # type: ignore[no-untyped-def]
     for p in range(first, last):
         version = pair_version[p]
         begin, end = tile_begin[pair_tile[p]], tile_begin[pair_tile[p] + 1]
-        count = _find_large(begin, end, index, scale, size[version], least[version], number)
+        count = _find_large(begin, end, index, worth, size[version], least[version], number)
         if count % 2:
             number[count] = number[count - 1]  # counts nothing
         _scale_large(count, number, index, scale, value, coefficients[version], even, odd, bounds)
@@ -125,52 +125,57 @@ def _multiply_run(  # type: ignore[no-untyped-def]
 
 @parallel_kernel
 def multiply_large_terms(  # type: ignore[no-untyped-def]
-    tile_begin, index, scale, value, coefficients, size, least, pair_tile, pair_version, out
+    tile_begin, index, scale, worth, value, coefficients, size, least, pair_tile, pair_version, out
 ):
     """`multiply_paired_tiles` without small terms, from tiles as `multiply_tiles` takes them.
 
     Parameters
     ----------
+    worth : (n,) float32
+        What a coefficient counts.
     size : (n_versions, m) float32
         Largest size of each coefficient's channels.
     least : (n_versions,) float32
-        Terms ``scale * size`` below are left out; 0 leaves out none.
+        Terms ``worth * size`` below are left out; 0 leaves out none.
     """
     cost_end = sum_costs(tile_begin, pair_tile)
     for part in prange(_PARTS):
         first, last = share(cost_end, part), share(cost_end, part + 1)
         _multiply_run(
-            tile_begin, index, scale, value, coefficients, size, least, pair_tile, pair_version, first, last, out
+            tile_begin, index, scale, worth, value, coefficients, size, least, pair_tile, pair_version, first, last, out
         )
 
 
 @parallel_kernel
-def find_large_terms(tile_begin, index, scale, size, least, number, count):  # type: ignore[no-untyped-def]
-    """Coefficients of each tile whose terms ``scale * size (m,)`` are at least `least`.
+def find_large_terms(tile_begin, index, worth, size, least, number, count):  # type: ignore[no-untyped-def]
+    """Coefficients of each tile whose terms ``worth * size (m,)`` are at least `least`.
 
     Their numbers go to `number` (n,) from each tile's begin on, and how many they are to `count` (n_tiles,).
     """
     for t in prange(len(tile_begin) - 1):
         begin, end = tile_begin[t], tile_begin[t + 1]
-        count[t] = _find_large(begin, end, index, scale, size, least, number[begin:end])
+        count[t] = _find_large(begin, end, index, worth, size, least, number[begin:end])
 
 
 @kernel
-def _copy_terms(number, index, scale, value, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+def _copy_terms(number, index, scale, worth, value, out_index, out_scale, out_worth, out_value):  # type: ignore[no-untyped-def]
     n_bytes = value.shape[1]
     source, target = address_of(value), address_of(out_value)
     for i in range(len(number)):
         k = np.int64(number[i])
-        out_index[i], out_scale[i] = index[k], scale[k]
+        out_index[i], out_scale[i], out_worth[i] = index[k], scale[k], worth[k]
         for offset in range(0, n_bytes, 64):
             store(target + offset, load(source + n_bytes * k + offset))
         target += n_bytes
 
 
 @parallel_kernel
-def copy_terms(tile_begin, number, begin, index, scale, value, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+def copy_terms(  # type: ignore[no-untyped-def]
+    tile_begin, number, begin, index, scale, worth, value, out_index, out_scale, out_worth, out_value
+):
     """Terms found by `find_large_terms` to tiles, those of tile t from ``begin[t]`` on; values are bytes (n, 64 k)."""
     for t in prange(len(tile_begin) - 1):
         some = slice(begin[t], begin[t + 1])
         found = number[tile_begin[t] : tile_begin[t] + begin[t + 1] - begin[t]]
-        _copy_terms(found, index, scale, value, out_index[some], out_scale[some], out_value[some])
+        outputs = out_index[some], out_scale[some], out_worth[some], out_value[some]
+        _copy_terms(found, index, scale, worth, value, *outputs)

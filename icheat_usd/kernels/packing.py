@@ -331,14 +331,14 @@ def _refit_tile(light, index, value, lost):  # type: ignore[no-untyped-def]
 def _quantise(value, square, quanta, rest):  # type: ignore[no-untyped-def]
     """Round a coefficient (64,) to quanta at an address, and leave the rest at another.
 
-    Returns the value of a quantum, and the rest's sum of squares times `square`.
+    Returns the value of a quantum, and the sums of squares times `square` of the rest and of what was rounded.
     """
-    largest, left = zeros(), zeros()
+    largest, left, kept = zeros(), zeros(), zeros()
     for offset in range(0, _ROW, _VECTOR):
         largest = larger(largest, load(value + offset))
     scale = peak(largest) / np.float32(127)
     if scale < np.float32(1e-36):  # whose inverse might be infinite
-        return np.float32(0), np.float32(0)
+        return np.float32(0), np.float32(0), np.float32(0)
     inverse, one = spread(np.float32(1) / scale), spread(-scale)
     for offset in range(0, _ROW, _VECTOR):
         x = load(value + offset)
@@ -347,11 +347,12 @@ def _quantise(value, square, quanta, rest):  # type: ignore[no-untyped-def]
         difference = multiply_add(one, whole, x)
         store(rest + offset, difference)
         left = multiply_add(product(load(square + offset), difference), difference, left)
-    return scale, total(left)
+        kept = multiply_add(product(load(square + offset), x), x, kept)
+    return scale, total(left), total(kept)
 
 
 @kernel
-def _round_tile(index, value, square, energy, least, rest, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+def _round_tile(index, value, square, energy, least, rest, out_index, out_scale, out_worth, out_value):  # type: ignore[no-untyped-def]
     """Round coefficients to quanta, and what that leaves to quanta of its own where it counts; their number.
 
     What is left counts as a coefficient does in `_transform_tile`, and at the root always.
@@ -359,15 +360,15 @@ def _round_tile(index, value, square, energy, least, rest, out_index, out_scale,
     count = 0
     values, squares, left, quanta = address_of(value), address_of(square), address_of(rest), address_of(out_value)
     for e in range(len(index)):
-        scale, lost = _quantise(values + _ROW * e, squares, quanta + LANES * count, left)
+        scale, lost, kept = _quantise(values + _ROW * e, squares, quanta + LANES * count, left)
         if scale == np.float32(0):
             continue
-        out_index[count], out_scale[count] = index[e], scale
+        out_index[count], out_scale[count], out_worth[count] = index[e], scale, np.sqrt(kept)
         count += 1
         if index[e] == 0 or lost * energy[index[e]] >= least:
-            scale, _ = _quantise(left, squares, quanta + LANES * count, left)
+            scale, _, kept = _quantise(left, squares, quanta + LANES * count, left)
             if scale > np.float32(0):
-                out_index[count], out_scale[count] = index[e], scale
+                out_index[count], out_scale[count], out_worth[count] = index[e], scale, np.sqrt(kept)
                 count += 1
     return count
 
@@ -402,7 +403,7 @@ def transform_tiles(tables, tiles, tile, energy, least, index, value, count):  #
 
 
 @kernel
-def _pack_tile(tables, tiles, tile, light, least, index, value, out_index, out_scale, out_value):  # type: ignore[no-untyped-def]
+def _pack_tile(tables, tiles, tile, light, least, index, value, out_index, out_scale, out_worth, out_value):  # type: ignore[no-untyped-def]
     """Coefficients of a tile, refitted and rounded: how many there are, and how many are kept before rounding."""
     n_kept = _transform(tables, tiles, tile, light.energy, least, index, value)
     if n_kept > len(index):
@@ -415,13 +416,14 @@ def _pack_tile(tables, tiles, tile, light, least, index, value, out_index, out_s
             lost[a, row - first] = tiles.response[row, a]
     _refit_tile(light, index[some], value[some], lost)
     square, rest = _squares(tiles, first), np.zeros(LANES, np.float32)
-    count = _round_tile(index[some], value[some], square, light.energy, least, rest, out_index, out_scale, out_value)
+    outputs = out_index, out_scale, out_worth, out_value
+    count = _round_tile(index[some], value[some], square, light.energy, least, rest, *outputs)
     return count, n_kept
 
 
 @parallel_kernel
 def pack_tiles(  # type: ignore[no-untyped-def]
-    tables, tiles, tile, light, least, index, value, out_index, out_scale, out_value, count, n_kept
+    tables, tiles, tile, light, least, index, value, out_index, out_scale, out_worth, out_value, count, n_kept
 ):
     """Pack some tiles.
 
@@ -434,7 +436,7 @@ def pack_tiles(  # type: ignore[no-untyped-def]
     value : (n, room, 64) float32
         Scratch.
     out_index : (n, 2 room) int32
-    out_scale : (n, 2 room) float32
+    out_scale, out_worth : (n, 2 room) float32
     out_value : (n, 2 room, 64) int8
         Coefficients as in `PackedRows`.
     count : (n,) int64
@@ -443,6 +445,5 @@ def pack_tiles(  # type: ignore[no-untyped-def]
         Of how many. Where that is more than `room`, there is no result.
     """
     for i in prange(len(tile)):
-        count[i], n_kept[i] = _pack_tile(
-            tables, tiles, tile[i], light, least, index[i], value[i], out_index[i], out_scale[i], out_value[i]
-        )
+        outputs = out_index[i], out_scale[i], out_worth[i], out_value[i]
+        count[i], n_kept[i] = _pack_tile(tables, tiles, tile[i], light, least, index[i], value[i], *outputs)

@@ -340,10 +340,10 @@ def widen_two(builder: Any, values: Any) -> Any:
 def store_large(builder: Any, values: Any) -> Any:
     """Numbers of those of 16 terms that are `least` or more, one after the other to an address; how many they are.
 
-    Terms are ``size[index] * scale``: addresses of 16 int32 indices, of 16
-    float32 scales and of the sizes, `least`, the number of the first term, and the address for int32 numbers.
+    Terms are ``size[index] * worth``: addresses of 16 int32 indices, of 16
+    float32 worths and of the sizes, `least`, the number of the first term, and the address for int32 numbers.
     """
-    index, scale, size, least, first, place = values
+    index, worth, size, least, first, place = values
     i64, flags = ir.IntType(64), ir.VectorType(ir.IntType(1), 16)
     offset = builder.shl(builder.sext(_load(builder, index, _I16X), ir.VectorType(i64, 16)), _all(i64, 2))
     address = builder.add(offset, _spread(builder, size, ir.VectorType(i64, 16)))
@@ -355,7 +355,7 @@ def store_large(builder: Any, values: Any) -> Any:
     )
     every = ir.Constant(flags, [1] * 16)
     found = builder.call(gather, [pointers, ir.Constant(_I32, 4), every, ir.Constant(_F16X, [0.0] * 16)])
-    term = builder.fmul(found, _load(builder, scale, _F16X))
+    term = builder.fmul(found, _load(builder, worth, _F16X))
     large = builder.fcmp_ordered(">=", term, _spread(builder, least, _F16X))
     number = builder.add(_spread(builder, builder.trunc(first, _I32), _I16X), ir.Constant(_I16X, list(range(16))))
     keep = cgutils.get_or_insert_function(

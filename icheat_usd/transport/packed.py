@@ -38,6 +38,7 @@ class PackedRows:
     tile_begin: I64  #: (n_tiles + 1,) first coefficient of each tile
     index: I32  #: (n,) coefficient, ascending within a tile; what rounding left of it may follow as a second entry
     scale: F32  #: (n,) value of one quantum
+    worth: F32  #: (n,) root of the sum over pixels of the squared value times tint
     value: NDArray[np.int8] | F32  #: (n, 64) quanta, one column per row of the tile; 0 beyond the last row
 
     @property
@@ -74,23 +75,24 @@ class PackedRows:
         return out[: self.n_rows]
 
     def of_large_terms(self, size: F32, least: float) -> PackedRows:
-        """With the entries alone whose terms ``scale * size (n_leaves,)`` are at least `least`, and the roots."""
+        """With the entries alone whose terms ``worth * size (n_leaves,)`` are at least `least`, and the roots."""
         of_roots = np.append(np.float32(np.inf), size[1:])
         number, count = np.empty(len(self.index), np.int32), np.empty(self.n_tiles, np.int64)
-        find_large_terms(self.tile_begin, self.index, self.scale, of_roots, np.float32(least), number, count)
+        find_large_terms(self.tile_begin, self.index, self.worth, of_roots, np.float32(least), number, count)
         begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-        index, scale = np.empty(begin[-1], np.int32), np.empty(begin[-1], np.float32)
+        index, (scale, worth) = np.empty(begin[-1], np.int32), np.empty((2, begin[-1]), np.float32)
         value = np.empty((begin[-1], LANES), self.value.dtype)
-        terms = self.index, self.scale, self.value.view(np.int8)
-        copy_terms(self.tile_begin, number, begin, *terms, index, scale, value.view(np.int8))
-        return replace(self, tile_begin=begin, index=index, scale=scale, value=value)
+        terms = self.index, self.scale, self.worth, self.value.view(np.int8)
+        copy_terms(self.tile_begin, number, begin, *terms, index, scale, worth, value.view(np.int8))
+        return replace(self, tile_begin=begin, index=index, scale=scale, worth=worth, value=value)
 
     def tiles(self, first: int, last: int) -> PackedRows:
         """Tiles ``first:last`` as rows of their own."""
         begin = self.tile_begin[first : last + 1]
         some = slice(begin[0], begin[-1])
         n_rows = max(min(self.n_rows, last * LANES) - first * LANES, 0)
-        return PackedRows(self.tree, n_rows, begin - begin[0], self.index[some], self.scale[some], self.value[some])
+        floats = self.scale[some], self.worth[some]
+        return PackedRows(self.tree, n_rows, begin - begin[0], self.index[some], *floats, self.value[some])
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +172,7 @@ class PackedTransport:
             return self
         size = np.ascontiguousarray(size, np.float32)
         least = LargeTerms(self).least(size, max_bytes)
-        lobes = [
-            replace(lobe, rows=lobe.rows.of_large_terms(size, of_lobe))
-            for lobe, of_lobe in zip(self.lobes, least, strict=True)
-        ]
+        lobes = (replace(lobe, rows=lobe.rows.of_large_terms(size, least)) for lobe in self.lobes)
         return replace(self, lobes=tuple(lobes))
 
 
@@ -186,23 +185,21 @@ class LargeTerms:
     """
 
     def __init__(self, transport: PackedTransport, seed: int = 0) -> None:
-        lobes = transport.lobes
-        tint = [float(np.sqrt(np.mean(np.square(lobe.tint), dtype=np.float64))) for lobe in lobes]
-        self._tint = np.array(tint, np.float32)
-        begin = np.concatenate([[0], np.cumsum([len(lobe.rows.index) for lobe in lobes])])
+        rows = [lobe.rows for lobe in transport.lobes]
+        begin = np.concatenate([[0], np.cumsum([len(of_lobe.index) for of_lobe in rows])])
         self.n_terms = int(begin[-1])  #: of all lobes
         sample = np.arange(self.n_terms)
         if self.n_terms > _SAMPLED:
             sample = np.sort(np.random.default_rng(seed).integers(self.n_terms, size=_SAMPLED))
         parts = [
-            (lobe.rows, sample[(sample >= first) & (sample < last)] - first, of_lobe)
-            for lobe, first, last, of_lobe in zip(lobes, begin[:-1], begin[1:], self._tint, strict=True)
+            (of_lobe, sample[(sample >= first) & (sample < last)] - first)
+            for of_lobe, first, last in zip(rows, begin[:-1], begin[1:], strict=True)
         ]
-        self._index = np.concatenate([rows.index[some] for rows, some, _ in parts])
-        self._scale = np.concatenate([rows.scale[some] * of_lobe for rows, some, of_lobe in parts])
+        self._index = np.concatenate([of_lobe.index[some] for of_lobe, some in parts])
+        self._worth = np.concatenate([of_lobe.worth[some] for of_lobe, some in parts])
 
-    def least(self, size: F32, max_bytes: int) -> F32:
-        """Least size of ``scale * size`` in each lobe, so that larger terms take about `max_bytes`: (n_lobes,).
+    def least(self, size: F32, max_bytes: int) -> float:
+        """Least ``worth * size`` of terms, so that larger ones take about `max_bytes`.
 
         Parameters
         ----------
@@ -211,7 +208,6 @@ class LargeTerms:
         """
         n_kept = round(len(self._index) * max_bytes / (max(self.n_terms, 1) * _BYTES_OF_TERM))
         if n_kept >= len(self._index):
-            return np.zeros(len(self._tint), np.float32)
-        term = np.where(self._index == 0, np.float32(np.inf), np.take(size, self._index) * self._scale)  # roots stay
-        least = np.partition(term, -n_kept)[-n_kept] if n_kept > 0 else np.float32(np.inf)
-        return np.divide(least, self._tint, out=np.full(len(self._tint), np.inf, np.float32), where=self._tint > 0)
+            return 0.0
+        term = np.where(self._index == 0, np.float32(np.inf), np.take(size, self._index) * self._worth)  # roots stay
+        return float(np.partition(term, -n_kept)[-n_kept]) if n_kept > 0 else np.inf

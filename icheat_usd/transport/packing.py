@@ -20,7 +20,7 @@ _TILES_AT_ONCE = 16
 _TILES_OF_A_TRIAL = 16  # that the amount to keep is found on; spread over all
 _TRIALS = 6
 _FIRST_ROOM = 16384  # coefficients of a tile
-_FIRST_LEAST = 2e-4  # worth of a coefficient to begin the search with, of a tile's tolerated squared error
+_FIRST_LEAST = 1e-3  # worth of a coefficient to begin the search with, of a tile's tolerated squared error
 _CLOSE_ENOUGH = 1.08  # ratio of errors at which the search for the amount ends
 _PRIOR = 0.2  # share of the energy that is taken from a coefficient's surroundings: the training lights are few
 _PRIOR_LEVELS = 4  # of ancestors that these surroundings reach up
@@ -42,6 +42,7 @@ class _Tile(NamedTuple):
 
     coefficient: I32
     scale: F32
+    worth: F32
     value: NDArray[np.int8]
 
 
@@ -58,6 +59,7 @@ class _Packer:
         self._index, self._value = np.empty((n, room), np.int32), np.empty((n, room, LANES), np.float32)
         self._packed = _Tile(
             np.empty((n, 2 * room), np.int32),
+            np.empty((n, 2 * room), np.float32),
             np.empty((n, 2 * room), np.float32),
             np.empty((n, 2 * room, LANES), np.int8),
         )
@@ -81,8 +83,11 @@ class _Packer:
             if n_kept.max() <= self._index.shape[1]:
                 break
             self._make_room(min(self.tree.n_leaves, 5 * int(n_kept.max()) // 4))
-        index, scale, value = self._packed
-        return [_Tile(index[i, :n].copy(), scale[i, :n].copy(), value[i, :n].copy()) for i, n in enumerate(count)]
+        index, scale, worth, value = self._packed
+        return [
+            _Tile(index[i, :n].copy(), scale[i, :n].copy(), worth[i, :n].copy(), value[i, :n].copy())
+            for i, n in enumerate(count)
+        ]
 
 
 def pack(
@@ -177,7 +182,10 @@ def lossless(rows: SparseRows, tree: ClusterTree) -> PackedRows:
         counts,
     )
     used = np.arange(room) >= room - counts[:, None]
-    return PackedRows(tree, rows.n_rows, _begin(counts), index[used], np.ones(counts.sum(), np.float32), value[used])
+    value = value[used]
+    one = np.ones(len(value), np.float32)
+    worth = np.sqrt(np.sum(np.square(value), axis=1))
+    return PackedRows(tree, rows.n_rows, _begin(counts), index[used], one, worth, value)
 
 
 def _weigh(lobe: Lobe, interpolation: SparseRows | None, training: F32) -> _Weighted:
@@ -286,15 +294,17 @@ def _try(
 
 
 def _next_trial(tried: list[tuple[float, float]]) -> float:
-    """Where the logarithm of the ratio may be 0: by the slope between the nearest points, within what is known."""
-    below = max((worth for worth, ratio in tried if ratio < 0), default=-np.inf)
-    above = min((worth for worth, ratio in tried if ratio >= 0 and worth > below), default=np.inf)
+    """Where the logarithm of the ratio may be 0: between the nearest points on either side, or beyond those on one."""
+    below = max((point for point in tried if point[1] < 0), default=None)
+    above = min((point for point in tried if point[1] >= 0 and (below is None or point[0] > below[0])), default=None)
+    if below is not None and above is not None:
+        share = below[1] / (below[1] - above[1])
+        return below[0] + float(np.clip(share, 0.1, 0.9)) * (above[0] - below[0])
     nearest = sorted(tried, key=lambda point: abs(point[1]))
-    slope = 0.4
+    slope = 0.3
     if len(tried) > 1 and nearest[0][0] != nearest[1][0]:
         slope = float(np.clip((nearest[0][1] - nearest[1][1]) / (nearest[0][0] - nearest[1][0]), 0.15, 1.0))
-    guess = nearest[0][0] - nearest[0][1] / slope
-    return guess if below < guess < above or not np.isfinite(below + above) else 0.5 * (below + above)
+    return nearest[0][0] - nearest[0][1] / slope
 
 
 def _some_tiles(n_tiles: int) -> I64:
@@ -330,9 +340,11 @@ def _sparse_tiles(part: _Weighted) -> kernels.SparseTiles:
 
 def _join(tree: ClusterTree, n_rows: int, tiles: list[_Tile]) -> PackedRows:
     if not tiles:
-        tiles = [_Tile(np.empty(0, np.int32), np.empty(0, np.float32), np.empty((0, LANES), np.int8))] * (
-            -(-n_rows // LANES)
-        )
+        tiles = [
+            _Tile(
+                np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32), np.empty((0, LANES), np.int8)
+            )
+        ] * (-(-n_rows // LANES))
     begin = _begin(np.array([len(tile.coefficient) for tile in tiles], np.int64))
-    index, scale, value = (np.concatenate([tile[k] for tile in tiles]) for k in range(3))
-    return PackedRows(tree, n_rows, begin, index, scale, value)
+    index, scale, worth, value = (np.concatenate([tile[k] for tile in tiles]) for k in range(4))
+    return PackedRows(tree, n_rows, begin, index, scale, worth, value)

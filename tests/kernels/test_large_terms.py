@@ -20,7 +20,7 @@ def some_tiles() -> tuple[np.ndarray, ...]:
     index = np.concatenate([np.sort(rng.choice(N_COEFFICIENTS, n, replace=False)) for n in counts]).astype(np.int32)
     scale = (rng.random(begin[-1]) ** 6).astype(np.float32)
     value = rng.integers(-127, 128, (begin[-1], 64)).astype(np.int8)
-    return begin, index, scale, value
+    return begin, index, scale, (scale * rng.uniform(0.5, 1, len(scale))).astype(np.float32), value
 
 
 def some_light() -> np.ndarray:
@@ -34,16 +34,16 @@ PAIR_TILE, PAIR_VERSION = np.array([0, 0, 1, 2, 3, 1], np.int32), np.array([0, 1
 
 @pytest.mark.parametrize("least", [0.0, 0.01, 0.3, 1e6])
 def test_the_product_is_that_of_the_large_terms(least: float) -> None:
-    begin, index, scale, value = some_tiles()
+    begin, index, scale, worth, value = some_tiles()
     light = some_light()
     size = np.abs(light).max(axis=2)
     expected, found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
     multiply_large_terms(
-        begin, index, scale, value, light, size, np.full(2, least, np.float32), PAIR_TILE, PAIR_VERSION, found
+        begin, index, scale, worth, value, light, size, np.full(2, least, np.float32), PAIR_TILE, PAIR_VERSION, found
     )
     for p, (tile, version) in enumerate(zip(PAIR_TILE, PAIR_VERSION, strict=True)):
         entries = slice(begin[tile], begin[tile + 1])
-        large = size[version, index[entries]] * scale[entries] >= np.float32(least)
+        large = size[version, index[entries]] * worth[entries] >= np.float32(least)
         some = np.array([0, large.sum()], np.int64)
         one = np.zeros(1, np.int32)
         multiply_tiles(
@@ -65,12 +65,12 @@ def test_the_product_is_that_of_the_large_terms(least: float) -> None:
 
 
 def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
-    begin, index, scale, value = some_tiles()
+    begin, index, scale, worth, value = some_tiles()
     light = some_light()
     size, least = np.abs(light).max(axis=2), np.full(2, 0.01, np.float32)
     found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
     for threads, out in zip((1, 2), found, strict=True):
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-        multiply_large_terms(begin, index, scale, value, light, size, least, PAIR_TILE, PAIR_VERSION, out)
+        multiply_large_terms(begin, index, scale, worth, value, light, size, least, PAIR_TILE, PAIR_VERSION, out)
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert np.array_equal(found[0], found[1])
