@@ -69,7 +69,7 @@ def run_once(stage: str, effort: Effort, environment: dict[str, str], output: Pa
 def markdown(results: list[dict[str, Any]]) -> list[str]:
     """Table for README."""
     lines = [
-        "| stage | caches | imports (beside the rest) | first usable preview | full transport | at rest | peak memory |",
+        "| stage | caches | imports, apart | first usable preview | full transport | at rest | peak memory |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
     ]
     for one in results:
