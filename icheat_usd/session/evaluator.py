@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -72,12 +73,15 @@ class Evaluator:
         Raises
         ------
         EditError, LightError
-            A value does not fit; the lights are then as before.
+            A value does not fit; show what was shown before, then, to bring it back.
         """
         if state is self._shown and stack is self._stack:
             return
         if state.lights is not self._shown.lights:
-            self._show_lights(self._shown, state)
+            before = self._shown
+            # Known before it is done: some lights may have changed when another one refuses.
+            self._shown = replace(before, lights=state.lights)
+            self._show_lights(before, state)
             self._seen.update(self.lights.snapshot())
         self.relighter.set_stack(self._laid_over(stack, state))
         self._shown, self._stack = state, stack

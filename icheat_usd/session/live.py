@@ -41,8 +41,8 @@ from icheat_usd.session.document import Session
 from icheat_usd.session.light_changes import all_lights, changed_light, new_light
 from icheat_usd.session.live_frames import Level, Listener, LiveFrames
 from icheat_usd.session.live_history import LiveHistory, Step
-from icheat_usd.session.live_state import UNCHANGED, LightChange, LiveState, moved
-from icheat_usd.session.quality import PREVIEW, Quality
+from icheat_usd.session.live_state import UNCHANGED, LightChange, LiveState, moved, number, numbers
+from icheat_usd.session.quality import LIVE, Quality
 from icheat_usd.stage.layer_versions import LayerVersion, go_to_version, layer_version
 
 #: Memory for frames by default: a quarter of the machine's.
@@ -81,7 +81,7 @@ class LiveSession:
         cls,
         stage: str | Path | Any,
         *,
-        quality: Quality = PREVIEW,
+        quality: Quality = LIVE,
         memory: int | None = None,
         prefetch: Sequence[float] = (),
         **choices: Any,
@@ -159,10 +159,18 @@ class LiveSession:
         return self._frames.here().snapshot
 
     def pick(self, x: int, y: int) -> tuple[str, F64] | None:
-        """Surface and place (metres, stage axes) that a pixel shows, counted from the top left; None: the sky."""
+        """Surface and place (metres, stage axes) that a pixel shows, counted from the top left; None: the sky.
+
+        Raises
+        ------
+        EditError
+            The image has no such pixel.
+        """
         with self._frames.looking() as frame:
             assert frame.evaluator is not None
             view = frame.evaluator.view
+            if not (0 <= x < view.width and 0 <= y < view.height):
+                raise EditError(f"pixel ({x}, {y}) is not in the image of {view.width} x {view.height}")
             sample = int(np.searchsorted(view.pixel, y * view.width + x))
             if sample >= view.n or view.pixel[sample] != y * view.width + x:
                 return None
@@ -245,9 +253,8 @@ class LiveSession:
     def set_amount(self, edit: str, amount: float) -> None:
         """How much of an edit is laid over the weaker ones, by its name or path; 0 leaves it out."""
         path = self._edit(edit)
-        if not np.isfinite(amount):
-            raise EditError(f"{path}: the amount is {amount!r}, expected a finite number")
-        self._do(f"amount {path}", self.state.with_edit(path, amount=float(amount)))
+        amount = number(amount, f"{path}: the amount")
+        self._do(f"amount {path}", self.state.with_edit(path, amount=amount))
 
     def set_parameters(self, edit: str, **values: Value) -> None:
         """Parameters of an edit's operation, at all its keys."""
@@ -282,8 +289,15 @@ class LiveSession:
         """
         path, frame = self._edit(edit), self._frames.here()
         selected, mask = self._side(path, side)
-        centre = (np.asarray(at, np.float64) - frame.snapshot.centre).astype(np.float32)
-        painted = dabbed(frame.places, selected, mask, centre, float(radius), float(strength))
+        centre = (numbers(at, 3, "the place of a dab") - frame.snapshot.centre).astype(np.float32)
+        painted = dabbed(
+            frame.places,
+            selected,
+            mask,
+            centre,
+            number(radius, "the radius of a dab"),
+            number(strength, "the strength of a dab"),
+        )
         self._do(f"dab {path}", self.state.with_edit(path, **{_MASKS[side]: painted}))
 
     def fill_mask(self, edit: str, weight: float, *, side: str = "receivers") -> None:
@@ -392,9 +406,11 @@ class LiveSession:
         """Commands in the block are one step for undo: a drag, from press to release."""
         with self._frames.command():
             first = self._history.mark()
-        yield
-        with self._frames.command():
-            self._history.join(first, label)
+        try:
+            yield
+        finally:
+            with self._frames.command():
+                self._history.join(first, label)
 
     def undo(self) -> str | None:
         """Take back the last step; what it was, None if there is none.

@@ -58,6 +58,9 @@ class LiveEvent:
 
 Listener = Callable[[LiveEvent], None]
 
+#: Frames that another one interrupted whose parts are kept.
+_MOST_UNFINISHED = 2
+
 
 class LiveFrame:
     """One frame: what the stage says at it, and the best that there is to show it with."""
@@ -170,9 +173,10 @@ class LiveFrames:
             except IcheatError:
                 frame.evaluator.show(stack, before)
                 raise
-            if state.lights is not before.lights:
-                self._lights_changed()
         self.state = state
+        self._failed.clear()
+        if state is not before:
+            self._changed()
 
     def stack_of(self, frame: LiveFrame) -> EditStack:
         """What the stage says about edits at a frame."""
@@ -189,6 +193,8 @@ class LiveFrames:
     def scrub(self, frame: float | None) -> bool:
         """Put the playhead at a frame; whether it can be shown without waiting."""
         with self.command():
+            if frame != self.resident.playhead:
+                self._changed()  # frames share what shows them: it has to come back to this one's edits
             self.resident.move(frame)
             self.session.frame = frame
             ready = self.level is not Level.NONE
@@ -202,7 +208,8 @@ class LiveFrames:
     def close(self) -> None:
         self._background.close()
 
-    def _lights_changed(self) -> None:
+    def _changed(self) -> None:
+        """What is shown is to be refined again."""
         for number in self.resident.frames():
             frame = self.resident.get(number)
             if frame is not None and frame.level is Level.REST:
@@ -304,6 +311,8 @@ class LiveFrames:
             quality = session.quality if level is Level.FULL else coarse(session.quality)
             entry = self.resident.get(number)
             snapshot = self._read_snapshot(number) if entry is None else entry.snapshot
+            while len(self._building) >= _MOST_UNFINISHED:
+                del self._building[next(iter(self._building))]
             self._building[number, level] = ShotParts(
                 quality,
                 snapshot=snapshot,

@@ -31,22 +31,22 @@ class LiveHistory:
     def __init__(self) -> None:
         self._done: list[Step] = []
         self._undone: list[Step] = []
-        self._n_added = 0
+        self._n_forgotten = 0
 
     def add(self, step: Step) -> None:
         """Something was done; what was undone before cannot be done again."""
         self._undone.clear()
         self._done.append(step)
-        self._n_added += 1
+        self._n_forgotten += max(0, len(self._done) - _LONGEST)
         del self._done[:-_LONGEST]
 
     def mark(self) -> int:
         """A place in the history, for `join`."""
-        return self._n_added
+        return self._n_forgotten + len(self._done)
 
     def join(self, mark: int, label: str) -> None:
         """Make one step of all that were added since."""
-        first = max(0, len(self._done) - (self._n_added - mark))
+        first = max(0, mark - self._n_forgotten)
         steps = self._done[first:]
         if steps:
             written = tuple(pair for step in steps for pair in step.written)

@@ -74,7 +74,7 @@ def test_play_shows_every_frame_as_a_session_of_its_own_would_and_keeps_to_the_l
         assert 0 < memory["own"] < memory["frame"] < memory["total"] < len(frames) * memory["frame"]
         live.scrub(21.0)
         np.testing.assert_array_equal(live.frame(level="rest"), images[21.0])
-        limit = int(1.5 * memory["frame"])
+        limit = int(memory["frame"] + 1.5 * memory["own"])
         with LiveSession.open(stage, frame=20.0, memory=limit, **choices) as small:
             for frame, image in small.play(frames, level="rest"):
                 np.testing.assert_array_equal(image, images[frame])

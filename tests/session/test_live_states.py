@@ -1,0 +1,117 @@
+"""A live session shows what its state says, by whatever way it came there."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icheat_usd.errors import EditError, IcheatError
+from icheat_usd.session import Quality, Session
+from icheat_usd.session.live import LiveSession
+from icheat_usd.session.live_state import UNCHANGED
+from tests.session.test_session import ROOM
+
+# Coarsely packed, so that what is not refined shows.
+QUALITY = Quality(
+    n_gather=192, rays_per_row=64, rays_per_bounce_row=16, light_samples=2, n_bounces=3, packing_error=0.2
+)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("room") / "room.usda"
+    path.write_text(ROOM)
+    session = Session.open(path)
+    session.add_edit(
+        "warm", layer="room.usda", parameters={"gain": 3.0}, receivers=["/World/Room"], casters=["/World/Block"]
+    )
+    return path
+
+
+def open_live(stage: Path) -> LiveSession:
+    return LiveSession.open(stage, width=20, height=15, quality=QUALITY)
+
+
+def within(seconds: float, act: Callable[[], object]) -> None:
+    """Fail where `act` does not come back."""
+    thread = threading.Thread(target=act, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    assert not thread.is_alive()
+
+
+def test_looking_at_once_waits_and_does_not_hang(stage: Path) -> None:
+    with open_live(stage) as live:
+        within(300, lambda: live.stack)
+        live.scrub(5)
+        within(300, lambda: live.stack)
+        assert live.frame(level="none").shape == (15, 20, 3)
+
+
+def test_at_rest_an_image_depends_on_the_state_alone(stage: Path) -> None:
+    with open_live(stage) as live:
+        live.wait("rest")
+        live.set_amount("warm", 0.5)
+        changed = live.frame(level="rest")
+        live.undo()
+        back = live.frame(level="rest")
+    with open_live(stage) as live:
+        untouched = live.frame(level="rest")
+        live.set_amount("warm", 0.5)
+        fresh = live.frame(level="rest")
+    np.testing.assert_array_equal(changed, fresh)
+    np.testing.assert_array_equal(back, untouched)
+    assert not np.array_equal(back, changed)
+
+
+def test_a_refused_state_leaves_the_lights_as_they_were(stage: Path) -> None:
+    with open_live(stage) as live:
+        before = live.frame(level="rest")
+        light = next(iter(live.lights))
+        refused = live.state.with_light(light, gain=(3.0, 3.0, 3.0))
+        refused = refused.with_parameters(live.stack.edits[0].path, {"gain": "nonsense"})
+        with pytest.raises(IcheatError):
+            live.show(refused)
+        assert live.state == UNCHANGED or live.state is UNCHANGED
+        np.testing.assert_array_equal(live.frame(level="rest"), before)
+
+
+def test_a_gesture_joins_its_own_steps_alone(stage: Path) -> None:
+    with open_live(stage) as live:
+        live.set_amount("warm", 0.1)
+        with live.gesture("drag"):
+            live.set_amount("warm", 0.2)
+            live.undo()
+            live.set_amount("warm", 0.3)
+        assert live.undo() == "drag"
+        assert live.stack.edits[0].amount == pytest.approx(0.1)
+        with pytest.raises(RuntimeError), live.gesture("broken off"):
+            live.set_amount("warm", 0.4)
+            live.set_amount("warm", 0.5)
+            raise RuntimeError
+        assert live.undo() == "broken off"
+        assert live.stack.edits[0].amount == pytest.approx(0.1)
+
+
+def test_mistakes_are_one_clear_error(stage: Path) -> None:
+    with open_live(stage) as live:
+        light = next(iter(live.lights))
+        mistakes: dict[str, Callable[[], object]] = {
+            "move": lambda: live.set_light(light, move=(1,)),
+            "axis": lambda: live.set_light(light, turn=((0, 0, 0), 30)),
+            "turn": lambda: live.set_light(light, turn=(30,)),
+            "size": lambda: live.set_light(light, size=(-1, 1)),
+            "to_world": lambda: live.set_light(light, to_world="here"),
+            "place of a dab": lambda: live.dab("warm", (0, 0), 1.0),
+            "radius": lambda: live.dab("warm", (0, 0, 0), "big"),
+            "amount": lambda: live.set_amount("warm", "lots"),
+            "pixel": lambda: live.pick(20, 3),
+        }
+        for named, mistake in mistakes.items():
+            with pytest.raises(EditError, match=named):
+                mistake()
+        assert live.undo() is None
