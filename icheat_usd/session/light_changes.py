@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from icheat_usd.errors import EditError
 from icheat_usd.image.texture import read_texture
 from icheat_usd.scene import F32, F64, LightKind, SceneSnapshot
-from icheat_usd.session.live_state import LightChange, LiveState, colour
+from icheat_usd.session.live_state import LightChange, LiveState, colour, number, numbers
 from icheat_usd.stage.textures import to_linear_rgba
 
 #: What `set_light` takes as an image.
@@ -119,26 +119,36 @@ def _filled(change: LightChange, own: LightChange) -> LightChange:
 
 
 def _size(path: str, size: Sequence[float]) -> tuple[float, float]:
-    if not 1 <= len(size) <= 2:
-        raise EditError(f"{path}: size is {size!r}, expected one number or two")
-    return float(size[0]), float(size[1]) if len(size) > 1 else 0.0
+    values = (*np.atleast_1d(np.asarray(size, object)), 0.0)
+    first, second = numbers(values if len(values) == 2 else values[:-1], 2, f"{path}: size")
+    if first < 0 or second < 0:
+        raise EditError(f"{path}: size is {size!r}, expected lengths, which are not negative")
+    return float(first), float(second)
 
 
 def _placed(
     path: str, now: ArrayLike | None, move: Sequence[float] | None, turn: tuple[Sequence[float], float] | None
 ) -> F64:
-    place: F64 = np.array(np.eye(3, 4) if now is None else now, np.float64)
+    try:
+        place: F64 = np.array(np.eye(3, 4) if now is None else now, np.float64)
+    except (TypeError, ValueError):
+        place = np.zeros(0)
     if place.shape != (3, 4) or not np.isfinite(place).all():
-        raise EditError(f"{path}: to_world needs shape (3, 4) and finite numbers, not {place.tolist()}")
+        raise EditError(f"{path}: to_world needs shape (3, 4) and finite numbers, not {now!r}")
     if turn is not None:
-        place[:, :3] = _rotation(*turn) @ place[:, :3]
+        place[:, :3] = _rotation(path, turn) @ place[:, :3]
     if move is not None:
-        place[:, 3] += np.asarray(move, np.float64)
+        place[:, 3] += numbers(move, 3, f"{path}: move")
     return place
 
 
-def _rotation(axis: Sequence[float], degrees: float) -> F64:
-    x, y, z = np.asarray(axis, np.float64) / (float(np.linalg.norm(axis)) or 1.0)
+def _rotation(path: str, turn: tuple[Sequence[float], float]) -> F64:
+    if not isinstance(turn, Sequence) or len(turn) != 2:
+        raise EditError(f"{path}: turn is {turn!r}, expected an axis and degrees, such as ((0, 1, 0), 30)")
+    axis, degrees = numbers(turn[0], 3, f"{path}: axis of the turn"), number(turn[1], f"{path}: degrees of the turn")
+    if not axis.any():
+        raise EditError(f"{path}: the axis of a turn has a direction, {turn[0]!r} has none")
+    x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.radians(degrees)
     turned: F64 = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from icheat_usd.edits.model import Blend, Edit, EditStack, KeyedPayload, Payload, SurfaceMask, Value
 from icheat_usd.errors import EditError
@@ -155,3 +156,33 @@ def colour(value: float | Sequence[float], what: str) -> Colour:
     if not all(np.isfinite(v) and v >= 0 for v in (r, g, b)):
         raise EditError(f"{what} is {value!r}; it must be finite and not negative")
     return r, g, b
+
+
+def numbers(values: ArrayLike, n: int, what: str) -> F64:
+    """Finite numbers, (n,) float64.
+
+    Raises
+    ------
+    EditError
+        They are not numbers, not `n`, or not finite.
+    """
+    try:
+        found = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        found = np.full(0, np.nan)
+    if found.shape != (n,) or not np.isfinite(found).all():
+        raise EditError(f"{what} is {values!r}, expected {n} finite numbers")
+    return found
+
+
+def number(value: object, what: str) -> float:
+    """A finite number.
+
+    Raises
+    ------
+    EditError
+        It is none.
+    """
+    if not isinstance(value, (int, float, np.integer, np.floating)) or not np.isfinite(value):
+        raise EditError(f"{what} is {value!r}, expected a finite number")
+    return float(value)
