@@ -21,7 +21,7 @@ from icheat_usd.transport.records import Records, RecordSettings, place_records,
 from icheat_usd.transport.sparse import SparseRows, concatenate_rows
 
 #: Rays of a row while records are placed. All rows have the same, so that neighbours differ by what they see.
-_PLACING_RAYS = 256
+_PLACING_RAYS = 128
 #: The same for every view sample, when outliers are looked for.
 _SURVEY_RAYS = 64
 _STRONG = 0.2  # reflectance: what reflects less follows from its neighbours, or is not missed
