@@ -24,7 +24,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,17 +33,17 @@ from icheat_usd.edits.model import EditStack, SurfaceMask, Value
 from icheat_usd.edits.operations.base import plain_values
 from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.image.film import Film
-from icheat_usd.scene import F32, F64, Finding, LightKind, SceneSnapshot
-from icheat_usd.session import authoring, films
-from icheat_usd.session.commit import write_changes
+from icheat_usd.scene import F32, F64, LightKind, SceneSnapshot
+from icheat_usd.session import films
 from icheat_usd.session.dabs import dabbed, filled_mask
 from icheat_usd.session.document import Session
 from icheat_usd.session.light_changes import all_lights, changed_light, new_light
+from icheat_usd.session.live_authoring import LiveAuthoring
 from icheat_usd.session.live_frames import Level, Listener, LiveFrames
 from icheat_usd.session.live_history import LiveHistory, Step
-from icheat_usd.session.live_state import UNCHANGED, LightChange, LiveState, moved, number, numbers
+from icheat_usd.session.live_state import LightChange, LiveState, moved, number, numbers
 from icheat_usd.session.quality import LIVE, Quality
-from icheat_usd.stage.layer_versions import LayerVersion, go_to_version, layer_version
+from icheat_usd.stage.layer_versions import LayerVersion, go_to_version
 
 #: Memory for frames by default: a quarter of the machine's.
 _SHARE_OF_MEMORY = 0.25
@@ -51,10 +51,8 @@ _SHARE_OF_MEMORY = 0.25
 #: Field of an `EditChange` for each side of an edit.
 _MASKS = {"receivers": "receiver_mask", "casters": "caster_mask"}
 
-Written = TypeVar("Written")
 
-
-class LiveSession:
+class LiveSession(LiveAuthoring):
     """A stage whose preview is being worked on. Make one with `open`, and close it, or use it in a `with` block.
 
     Commands may be given from several threads; they are served one after another.
@@ -316,88 +314,6 @@ class LiveSession:
         if len(masks) > 1 and any(mask is not masks[0] for mask in masks):
             raise EditError(f"{path} has several masks around this frame; go to one of its keys to paint")
         return getattr(edit, side).paths, masks[0] if masks else None
-
-    # Authoring --------------------------------------------------------------------------------------------------------
-
-    def commit(
-        self, layer: str, *, frame: float | None = None, sidecar: str | Path | None = None, why: str = ""
-    ) -> tuple[Finding, ...]:
-        """Write what was changed about edits to a layer and save it, as one step that can be undone.
-
-        Changes of lights stay what they are: changes that are shown.
-
-        Parameters
-        ----------
-        frame
-            Stage time to key the values at; without it they hold at all times.
-
-        Returns
-        -------
-        tuple of Finding
-            What has no effect, because a stronger layer decides it.
-
-        Raises
-        ------
-        EditError, SidecarError
-            Something cannot be written; the layer is then as before.
-        """
-        changes = self._frames.state
-        if not (changes.edits or changes.order):
-            return ()
-        session, stack = self.session, self.stack
-
-        def write() -> tuple[Finding, ...]:
-            return write_changes(session, changes, stack, layer=layer, frame=frame, sidecar=sidecar, why=why)
-
-        return self._author("commit", layer, write, replace(changes, edits=UNCHANGED.edits, order=()))
-
-    def add_edit(self, name: str, *, layer: str = "session", **values: Any) -> str:
-        """Add an edit to the stack, in the stage's session layer unless said otherwise; see `Session.add_edit`."""
-        return self._author(f"add {name}", layer, lambda: self.session.add_edit(name, layer=layer, **values))
-
-    def remove_edit(self, edit: str, *, layer: str) -> None:
-        """Take an edit out of the stack in a layer."""
-        path, session = self._edit(edit), self.session
-
-        def write() -> None:
-            authoring.remove_edit(session.stage, str(session.stack_path), path, layer=layer)
-
-        self._author(f"remove {path}", layer, write)
-
-    def set_edit(self, edit: str, *, layer: str, **values: Any) -> tuple[Finding, ...]:
-        """Write values of an edit to a layer at once; see `Session.set_edit`."""
-        path = self._edit(edit)
-        return self._author(f"set {path}", layer, lambda: self.session.set_edit(path, layer=layer, **values))
-
-    def set_key(self, edit: str, *, layer: str, frame: float | None, **values: Any) -> tuple[Finding, ...]:
-        """Write a keyframe to a layer at once; see `Session.set_key`."""
-        path = self._edit(edit)
-        return self._author(
-            f"key {path}", layer, lambda: self.session.set_key(path, layer=layer, frame=frame, **values)
-        )
-
-    def refresh(self) -> None:
-        """Look at the edits of the stage again, after something else has written to it."""
-        with self._frames.command():
-            self._frames.stacks_changed()
-            self._frames.set_state(self._frames.state)
-
-    def _author(self, label: str, layer: str, write: Callable[[], Written], after: LiveState | None = None) -> Written:
-        """Write to a layer; after any error the layer and what is shown are as before."""
-        with self._frames.command(), self._frames.stage_lock:
-            before, state = layer_version(self.session.stage, layer), self._frames.state
-            result = write()
-            made = layer_version(self.session.stage, layer)
-            self._frames.stacks_changed()
-            try:
-                self._frames.set_state(state if after is None else after)
-            except IcheatError:
-                go_to_version(made, before)
-                self._frames.stacks_changed()
-                self._frames.set_state(state)
-                raise
-            self._history.add(Step(label, state, self._frames.state, ((before, made),)))
-            return result
 
     # History ----------------------------------------------------------------------------------------------------------
 
