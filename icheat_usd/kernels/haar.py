@@ -63,9 +63,9 @@ def _transform_top(top_node, n_subtrees, left, right, share, detail, root, means
 
 @parallel_kernel
 def transform_versions(  # type: ignore[no-untyped-def]
-    values, subtree_leaf, subtree_node, run_begin, left, right, share, detail, top_node, root, top_means, out
+    values, subtree_leaf, subtree_node, run_begin, left, right, share, detail, top_node, root, top_means, slot, out
 ):
-    """Coefficients (n_versions, n_leaves, 4) of `values` (n_versions, n_leaves, 3); see `HaarPlan`.
+    """Coefficients of `values` (n_versions, n_leaves, 3) to ``out[slot]`` (n_slots, n_leaves, 4); see `HaarPlan`.
 
     `top_means` (n_versions, n_subtrees + n_top_nodes, 4) is work space.
     """
@@ -83,7 +83,7 @@ def transform_versions(  # type: ignore[no-untyped-def]
             share,
             detail,
             top_means[q],
-            out[q],
+            out[slot[q]],
         )
     for q in prange(n_versions):
-        _transform_top(top_node, len(subtree_node), left, right, share, detail, root, top_means[q], out[q])
+        _transform_top(top_node, len(subtree_node), left, right, share, detail, root, top_means[q], out[slot[q]])

@@ -22,6 +22,22 @@ def _add_lights(lost, factors, job, out):  # type: ignore[no-untyped-def]
         _add_scaled(lost[light, job], factors[light], out)
 
 
+@kernel
+def _sizes_run(first, end, colors, out):  # type: ignore[no-untyped-def]
+    for k in range(first, end):
+        out[k] = max(abs(colors[k, 0]), abs(colors[k, 1]), abs(colors[k, 2]))
+
+
+@parallel_kernel
+def largest_channels(versions, colors, out):  # type: ignore[no-untyped-def]
+    """Largest sizes of the channels of some versions, from colours (n_versions, n, 4) to `out` (n_versions, n)."""
+    n = colors.shape[1]
+    parts = (n + 8191) // 8192
+    for job in prange(len(versions) * parts):
+        first = job % parts * 8192
+        _sizes_run(first, min(n, first + 8192), colors[versions[job // parts]], out[versions[job // parts]])
+
+
 @parallel_kernel
 def add_light_residuals(lost, factors, n_tiles, out):  # type: ignore[no-untyped-def]
     """Add ``sum over lights of lost * factor`` to products.

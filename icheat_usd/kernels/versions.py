@@ -389,6 +389,22 @@ def haar_of_cells(versions, version_cells, deltas, version_nodes, nodes, child, 
         )
 
 
+@kernel
+def _fill_one(cells, deltas, out):  # type: ignore[no-untyped-def]
+    out[:] = np.float32(0)
+    for k in range(len(cells)):
+        for c in range(3):
+            out[cells[k], c] = deltas[k, c]
+
+
+@parallel_kernel
+def fill_versions(versions, version_cells, cells, deltas, out):  # type: ignore[no-untyped-def]
+    """Values of versions, one after the other, into `out` (n, n_leaves, 3), 0 but at their cells."""
+    for index in prange(len(versions)):
+        first, end = version_cells[versions[index]], version_cells[versions[index] + 1]
+        _fill_one(cells[first:end], deltas[first:end], out[index])
+
+
 @parallel_kernel
 def spread_cells(versions, version_cells, cells, deltas, out):  # type: ignore[no-untyped-def]
     """Values of versions at their cells into `out` (n_slots, n_leaves, 4)."""

@@ -9,15 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels.large_terms import multiply_large_terms
 from icheat_usd.kernels.packed import PairedTiles, multiply_paired_tiles, pair_coefficients
+from icheat_usd.kernels.residuals import largest_channels
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
-from icheat_usd.scene import F32, F64, I32, I64, U8
+from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
 from icheat_usd.transport import SparseRows, Transport
-from icheat_usd.transport.packed import LANES, PackedRows, PackedTransport
+from icheat_usd.transport.packed import LANES, LargeTerms, PackedRows, PackedTransport
 
 #: Versions with more cells than this are transformed as a whole, by all cores.
 _MANY_CELLS = 4096
+#: Quanta that are read of a large transport for light not seen before: a quarter of them loses little beside packing.
+MOVING_BYTES = 80_000_000
+#: Versions that are transformed at once.
+_TOGETHER = 8
+
+_NONE: F32 = np.zeros((1, 0), np.float32)
 
 
 class VersionTables(NamedTuple):
@@ -71,10 +79,16 @@ class Products:
         self.is_sparse = int(spread is not None)
         self.n_tiles = -(-(n_view if spread is None else spread.n_columns) // LANES)
         self._versions: F32 = np.zeros((0, self._n_leaves, 4), np.float32)
+        self._sizes: F32 = np.zeros((0, self._n_leaves), np.float32)  # largest channels of the versions
+        self._is_small: Bool = np.zeros(0, np.bool_)  # versions that are 0 nearly everywhere
         if self._haar:
             self._parent_of_leaf, self._parent = _parents(tree)
             self._share, self._root = _shares(tree)
             self._plan = plan_haar(tree)
+            self._large_terms = (
+                None if self._packed is None or self._packed.n_bytes < 2 * MOVING_BYTES else LargeTerms(self._packed)
+            )
+            self._leaves: F32 = np.zeros((_TOGETHER, self._n_leaves, 3), np.float32)
             self._unedited: F32 = np.zeros((1, self._n_leaves, 4), np.float32)
 
     def room(self, n_pairs: int) -> F32:
@@ -108,6 +122,10 @@ class Products:
             grown = np.zeros((max(n_versions, len(self._versions) * 3 // 2), self._n_leaves, 4), np.float32)
             grown[: len(self._versions)] = self._versions
             self._versions = grown
+            sizes = np.zeros(grown.shape[:2], np.float32)
+            sizes[: len(self._sizes)] = self._sizes
+            self._sizes = sizes
+            self._is_small = np.append(self._is_small, np.zeros(len(grown) - len(self._is_small), np.bool_))
 
     def nodes(self, cells: I32) -> tuple[I32, I32]:
         """Nodes of the tree above some cells and their children; nothing where no wavelets are needed."""
@@ -139,22 +157,32 @@ class Products:
                 self._root,
                 self._versions,
             )
-        for version in versions[large]:
-            some = slice(tables.cell_begin[version], tables.cell_begin[version + 1])
-            values = np.zeros((1, self._n_leaves, 3), np.float32)
-            values[0, tables.cells[some]] = deltas[some]
-            haar_of_versions(self._plan, values, self._versions[version : version + 1])
+        # A few at a time: what lies between the two steps stays in the cache.
+        for first in range(0, len(versions[large]), _TOGETHER):
+            some = versions[large][first : first + _TOGETHER]
+            values = self._leaves[: len(some)]
+            kernels.fill_versions(some, tables.cell_begin, tables.cells, deltas, values)
+            haar_of_versions(self._plan, values, self._versions, some)
+        self._is_small[versions] = ~large
+        largest_channels(versions[~large], self._versions, self._sizes)
 
     def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:
         """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows."""
-        if not len(pairs):
-            return
+        small = self._is_small[pair_version[pairs]]
+        for some, is_small in ((pairs[small], True), (pairs[~small], False)):
+            if len(some):
+                self._multiply_some(some, pair_tile, pair_version, out, narrow, is_small)
+
+    def _multiply_some(
+        self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool, small: bool
+    ) -> None:
         tile, version = pair_tile[pairs], pair_version[pairs]
+        least = np.full(len(self._versions) if small else 0, np.finfo(np.float32).tiny, np.float32)
         direct = len(pairs) == pairs[-1] - pairs[0] + 1 and bool((np.diff(pairs) == 1).all())
         part = slice(pairs[0], pairs[-1] + 1)
         for lobe in range(len(self._rows)):
             into = out[lobe, part] if direct else np.empty((len(pairs), LANES, 4), np.float32)
-            self._multiply(lobe, self._versions, tile, version, into, narrow)
+            self._multiply(lobe, self._versions, tile, version, into, narrow, self._sizes, least)
             if not direct:
                 out[lobe, pairs] = into
 
@@ -164,20 +192,42 @@ class Products:
         leaves = np.zeros((1, self._n_leaves, 4), np.float32)
         leaves[0, cells, :3] = values
         for lobe in range(len(self._rows)):
-            self._multiply(lobe, leaves, tile, np.zeros_like(tile), out[lobe], False)
+            self._multiply(lobe, leaves, tile, np.zeros_like(tile), out[lobe], False, _NONE, _NONE[0])
 
     def multiply_all(self, b: F32, out: F32, narrow: bool = False) -> None:
-        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``; `narrow`: as `multiply`."""
+        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``; `narrow`: as `multiply`.
+
+        Of a large transport, only the terms that are large in this light are read; see `MOVING_BYTES`.
+        """
+        size, least = _NONE, np.zeros((len(self._rows), 0), np.float32)
         if self._haar:
             values = haar_of_versions(self._plan, b[None], self._unedited)
+            if self._large_terms is not None and not narrow:
+                size = np.empty((1, self._n_leaves), np.float32)
+                largest_channels(np.zeros(1, np.int64), values, size)
+                least = np.full((len(self._rows), 1), self._large_terms.least(size[0], MOVING_BYTES), np.float32)
+                size[0, 0] = np.inf  # means stay, however dark it is
         else:
             values = np.zeros((1, self._n_leaves, 4), np.float32)
             values[0, :, :3] = b
         tile = np.arange(self.n_tiles, dtype=np.int32)
         for lobe in range(len(self._rows)):
-            self._multiply(lobe, values, tile, np.zeros_like(tile), out[lobe, : self.n_tiles], narrow)
+            self._multiply(
+                lobe, values, tile, np.zeros_like(tile), out[lobe, : self.n_tiles], narrow, size, least[lobe]
+            )
 
-    def _multiply(self, lobe: int, versions: F32, tile: I32, version: I32, out: F32, narrow: bool) -> None:
+    def _multiply(
+        self,
+        lobe: int,
+        versions: F32,
+        tile: I32,
+        version: I32,
+        out: F32,
+        narrow: bool,
+        size: F32,
+        least: F32,
+    ) -> None:
+        """`least` (n_versions,) leaves out terms; empty: none."""
         chosen = self._narrow if narrow else self._rows
         assert chosen is not None
         rows, paired = chosen[lobe].rows, chosen[lobe].paired
@@ -186,6 +236,21 @@ class Products:
             return
         if paired is None:
             kernels.multiply_pairs(rows.tile_begin, rows.index, rows.scale, rows.value, versions, tile, version, out)
+            return
+        if len(least):
+            multiply_large_terms(
+                rows.tile_begin,
+                rows.index,
+                rows.scale,
+                rows.worth,
+                rows.value,
+                versions,
+                size,
+                least,
+                tile,
+                version,
+                out,
+            )
             return
         multiply_paired_tiles(paired.tile_begin, paired.index, paired.scale, paired.value, versions, tile, version, out)
 

@@ -109,14 +109,16 @@ def plan_haar(tree: ClusterTree) -> HaarPlan:
     )
 
 
-def haar_of_versions(plan: HaarPlan, values: F32, out: F32 | None = None) -> F32:
+def haar_of_versions(plan: HaarPlan, values: F32, out: F32 | None = None, slots: I64 | None = None) -> F32:
     """`haar_forward` of several colour functions in float32: the same to about 1e-6 of a function's size.
 
     Parameters
     ----------
     values : (n_versions, n_leaves, 3) float32
-    out : (n_versions, n_leaves, 4) float32, optional
+    out : (n_slots, n_leaves, 4) float32, optional
         Receives the result.
+    slots : (n_versions,), optional
+        Where in `out` each version goes, in order by default.
 
     Returns
     -------
@@ -142,6 +144,7 @@ def haar_of_versions(plan: HaarPlan, values: F32, out: F32 | None = None) -> F32
         plan.top_node,
         plan.root,
         np.empty((len(values), len(plan.subtree_node) + len(plan.top_node), 4), np.float32),
+        np.arange(len(values)) if slots is None else slots,
         out,
     )
     return out

@@ -14,6 +14,7 @@ import pytest
 from icheat_usd.edits.model import Edit, EditStack, KeyedPayload, SurfaceMask
 from icheat_usd.errors import EditError
 from icheat_usd.relight.live import LiveRelighter
+from icheat_usd.samples.wavelets import haar_forward
 from icheat_usd.scene import F32
 from icheat_usd.transport import sum_lights
 from icheat_usd.transport.packed import PackedLobe, PackedTransport
@@ -225,7 +226,8 @@ def poor(of: PackedTransport) -> PackedTransport:
         size = np.sqrt(np.square(rows.value).sum(axis=1))
         kept = size > np.quantile(size, 0.6)
         begin = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)[rows.tile_begin]
-        rows = replace(rows, tile_begin=begin, index=rows.index[kept], scale=scale[kept], value=quanta[kept])
+        columns = {"index": rows.index, "scale": scale, "worth": rows.worth, "value": quanta}
+        rows = replace(rows, tile_begin=begin, **{name: column[kept] for name, column in columns.items()})
         lobes.append(replace(lobe, rows=rows))
     return replace(of, lobes=tuple(lobes))
 
@@ -270,6 +272,23 @@ def fresh_packed(of: Pipeline, rows: PackedTransport, stack: EditStack, gains: F
     shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights)
     shown.set_stack(stack)
     return shown
+
+
+def test_a_large_transport_is_read_in_part_while_lights_move(monkeypatch):
+    """What is left out are the smallest terms in this light; edits of few casters lose nothing."""
+    of, rows = pipeline("full"), poor(packed("full"))
+    stack = EditStack("/stack", (edit("a", "scale", select("/floor"), select("/red")),))
+    gains = np.ones((2, 3), np.float32)
+    whole = fresh_packed(of, rows, stack, gains)
+    monkeypatch.setattr("icheat_usd.relight.products.MOVING_BYTES", rows.n_bytes // 2)
+    shown = fresh_packed(of, rows, stack, gains)
+    b = shown.lights.total()
+    size = np.abs(haar_forward(of.gather.tree, b)).max(axis=1).astype(np.float32)
+    expected = rows.narrowed(size, rows.n_bytes // 2).to_view(b)
+    found = shown.relit().indirect
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=2e-4 * expected.max())
+    assert np.abs(found - whole.relit().indirect).max() > 0.01 * expected.max()
+    np.testing.assert_array_equal(shown._versions.values, whole._versions.values)
 
 
 def test_casters_painted_at_rest_have_all_rows(monkeypatch):
