@@ -16,8 +16,10 @@ _ROUNDS = 8  # of records, each of which may spare their neighbours one
 _LEAST = 0.0005  # of the samples: outliers for which a round is worth its time
 _CHUNK = 1 << 14  # samples
 _NOISE = 0.02  # squared relative error below which a light's noise does not count against it
-#: Of a set's variance: what the lesser of two sets that agree in sign by chance leaves, and some more.
-_CHANCE = 0.1
+#: Of a set's variance: what the lesser of two sets that agree in sign by chance leaves, and some more
+#: where geometry gives no reason for an outlier.
+_CHANCE, _CHANCE_ON_SHEETS = 0.1, 0.5
+_ON_SHEET = 0.99  # of a sample comes from the corners of its block, which all lie on one surface with it
 _BLOCK = 16  # pixels over which noise is averaged
 
 
@@ -62,9 +64,9 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
     everything = np.arange(view.n)
     scores = judge.scores(everything, table, mesh.record_view)
     most = int(settings.max_share * view.n)
-    noise = judge.smoothed(scores.noise)
+    noise = judge.smoothed(scores.noise) * np.where(records.fit > _ON_SHEET, _CHANCE_ON_SHEETS, _CHANCE)
     for round_ in range(_ROUNDS):
-        excess = np.where(mesh.record < 0, np.maximum(scores.sure - _CHANCE * noise, 0), 0)
+        excess = np.where(mesh.record < 0, np.maximum(scores.sure - noise, 0), 0)
         order = np.lexsort((everything, -excess))
         rest = np.cumsum(excess[order][::-1])[::-1] / view.n
         worst = order[: int(np.searchsorted(-rest, -(settings.tolerance**2)))]
