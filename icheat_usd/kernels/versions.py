@@ -49,9 +49,9 @@ def adjust_hsv(color, numbers, scale, emission):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def compose(
+def compose(  # type: ignore[no-untyped-def]
     member, first, end, entry_row, entry_weight, entry_slot, slots, row_table, row_amount, groups, b, cell, out
-):  # type: ignore[no-untyped-def]
+):
     """Compose the edits of one set at one caster into `out` (G, 4, 3): scale, [0] emission, diffuse and paint offset.
 
     Entries `first` to `end` are the caster's rows, weakest first. `row_table`
@@ -148,7 +148,7 @@ def compose(
 
 
 @kernel
-def _piece_deltas(
+def _piece_deltas(  # type: ignore[no-untyped-def]
     piece,
     row_changed,
     version_sets,
@@ -170,7 +170,7 @@ def _piece_deltas(
     cells,
     deltas,
     total,
-):  # type: ignore[no-untyped-def]
+):
     """One piece of `version_deltas`."""
     version = piece[0]
     restrict = version_restrict[version, 0]
@@ -272,7 +272,7 @@ def find_runs(cell_begin, entry_row, entry_weight, entry_slot, row_table, run_of
 
 
 @parallel_kernel
-def version_deltas(
+def version_deltas(  # type: ignore[no-untyped-def]
     pieces,
     row_changed,
     version_sets,
@@ -294,7 +294,7 @@ def version_deltas(
     cells,
     deltas,
     offsets,
-):  # type: ignore[no-untyped-def]
+):
     """Differences that versions make, at their cells, and sums of their offsets by piece.
 
     Parameters
@@ -574,7 +574,7 @@ def mark_pairs(samples, group, term_begin, term_version, sparse, indptr, indices
 
 
 @parallel_kernel
-def add_terms(
+def add_terms(  # type: ignore[no-untyped-def]
     samples,
     group,
     term_begin,
@@ -594,7 +594,7 @@ def add_terms(
     albedo,
     offsets,
     out,
-):  # type: ignore[no-untyped-def]
+):
     """Sum of the terms of each sample, added to ``out[k]``.
 
     Parameters
