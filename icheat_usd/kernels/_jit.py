@@ -23,8 +23,9 @@ from typing import Any, TypeVar, cast
 # slower; on idle cores it cost a final gather 8 % and the transport nothing. Read when OpenMP loads, before numba.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # They do spin for some tens of microseconds before, so that the short kernels of one live frame find them awake:
-# starting one then takes 3 microseconds instead of 17 to 80.
-os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+# starting one then takes 3 microseconds instead of 17 to 80. Five times as long made a frame 1.8 times slower where
+# another program holds a core, this a tenth.
+os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 import llvmlite  # noqa: E402
 import llvmlite.binding  # noqa: E402
