@@ -94,7 +94,8 @@ def changed_light(
     Raises
     ------
     LightError
-        A value has another shape or is not finite; the light consists of a mesh's triangles, whose place,
+        A value has another shape, is no number or not finite; a radiance or size is negative (what the stage
+        made negative stays so until it is changed); the light consists of a mesh's triangles, whose place,
         size and image belong to the mesh; its kind has no image.
     """
     lights, path = alone.lights, alone.light_paths[0]
@@ -106,26 +107,42 @@ def changed_light(
     columns: dict[str, np.ndarray] = {}
     for name, value, shape in (("to_world", to_world, (3, 4)), ("radiance", radiance, (3,)), ("size", size, (2,))):
         if value is not None:
-            columns[name] = _checked(path, name, value, shape)[None]
+            columns[name] = checked_numbers(path, name, value, shape)[None]
+            if name != "to_world" and (columns[name] < 0.0).any():
+                raise LightError(f"{name} of {path} must not be negative: {value!r}")
     if texture is not None:
+        texture = _image(path, texture)
         if kind not in (LightKind.DOME, LightKind.RECT):
             raise LightError(f"{path} is a {kind.name.lower()} light; only domes and rectangles have an image")
         if texture.size == 0:
             columns["texture"] = np.array([-1], np.int32)
         else:
-            if texture.ndim != 3 or texture.shape[2] not in (3, 4):
-                raise LightError(f"the image of {path} needs shape (height, width, 3 or 4), not {texture.shape}")
             textures, row = append_texture(scene.textures, texture)
             alone = replace(alone, textures=textures)
             columns["texture"] = np.array([row], np.int32)
     return replace(alone, lights=lights._replace(**columns))
 
 
-def _checked(path: str, name: str, value: ArrayLike, shape: tuple[int, ...]) -> F32:
-    array = np.array(value, np.float32)
+def checked_numbers(path: str, name: str, value: ArrayLike, shape: tuple[int, ...]) -> F32:
+    """A property `name` of the light `path` as a finite float32 array of a shape, or a LightError."""
+    try:
+        with np.errstate(over="ignore"):  # what float32 can't hold is refused below
+            array = np.array(value, np.float32)
+    except (TypeError, ValueError):  # text, or rows of unequal length
+        array = np.empty(0, np.float32)
     if array.shape != shape or not np.isfinite(array).all():
-        raise LightError(f"{name} of {path} needs finite numbers of shape {shape}, not {np.array(value).tolist()}")
+        raise LightError(f"{name} of {path} needs finite numbers of shape {shape}, not {value!r}")
     return array
+
+
+def _image(path: str, value: ArrayLike) -> F32:
+    try:
+        image = np.asarray(value, np.float32)
+    except (TypeError, ValueError):
+        raise LightError(f"the image of {path} needs numbers of shape (height, width, 3 or 4)") from None
+    if image.size and (image.ndim != 3 or image.shape[2] not in (3, 4)):
+        raise LightError(f"the image of {path} needs shape (height, width, 3 or 4), not {image.shape}")
+    return image
 
 
 def append_texture(textures: Textures, image: F32) -> tuple[Textures, int]:

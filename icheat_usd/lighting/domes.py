@@ -70,7 +70,9 @@ def see_sky(
     begin : (n_places + 1,)
         A place is the mean of its points; by default every point is one.
     """
-    owners, bins, weights, lobes = [], [], [], []
+    # empty ones first: a camera may see no surface
+    owners, bins = [np.empty(0, np.int64)], [np.empty(0, np.uint16)]
+    weights, lobes = [np.empty(0, np.float32)], [np.empty(0, np.float32)]
     edge_parts = np.zeros((len(points.instance), 2))
     step = max(1, _RAYS // n_samples)
     for first in range(0, len(points.instance), step):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from icheat_usd.lighting.change import LightError, changed_light, join_lights, new_light, one_light
+from icheat_usd.lighting.change import LightError, changed_light, checked_numbers, join_lights, new_light, one_light
 from icheat_usd.lighting.domes import BinnedSky
 from icheat_usd.relight.light_work import AnyLight, MovingLight, SparseView, Surroundings, build_surroundings
 from icheat_usd.samples import GatherSamples, ViewSamples
@@ -92,13 +92,22 @@ class LiveLights:
         return sum_lights(self.view_direct * self.gains[:, None, :])
 
     def set_gain(self, light: int, rgb: ArrayLike) -> None:
-        """Dim or recolour: factor of what the light was when it was last changed."""
-        gain = np.broadcast_to(np.asarray(rgb, np.float32), (3,))
-        if not (np.isfinite(gain).all() and (gain >= 0.0).all()):
-            raise LightError(
-                f"the gain of {self.paths[self._checked(light)]} must be finite and not negative, not {rgb!r}"
-            )
-        self.gains[self._checked(light)] = gain
+        """Dim or recolour: factor of what the light was when it was last changed.
+
+        Parameters
+        ----------
+        rgb : float or (3,)
+
+        Raises
+        ------
+        LightError
+            There is no such light, or `rgb` has another shape, is no number, not finite or negative.
+        """
+        path = self.paths[self._checked(light)]
+        gain = checked_numbers(path, "gain", rgb, () if np.isscalar(rgb) else (3,))
+        if (gain < 0.0).any():
+            raise LightError(f"gain of {path} must not be negative: {rgb!r}")
+        self.gains[light] = gain
         self.revision += 1
 
     def change(

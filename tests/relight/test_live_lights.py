@@ -175,8 +175,27 @@ def test_what_cannot_be_changed_says_so(scene: Pipeline) -> None:
         lights.change(1, texture=np.ones((2, 2, 3), np.float32))
     with pytest.raises(LightError, match="finite"):
         lights.change(0, size=(np.nan, 1))
-    with pytest.raises(LightError, match="not negative"):
+    with pytest.raises(LightError, match="not be negative"):
         lights.set_gain(0, -1.0)
+    before = lights.gains.copy(), lights.revision, lights.snapshot().lights
+    for gain in ((1, 2), "x", "abc", np.ones((3, 3)), np.inf, (1, 1, np.nan), None, 1e300):
+        with pytest.raises(LightError, match="gain of /rect needs finite numbers"):
+            lights.set_gain(0, gain)
+    for change in ({"size": (-1, 1)}, {"radiance": (1, 1, -1e-3)}):
+        with pytest.raises(LightError, match="of /rect must not be negative"):
+            lights.change(0, **change)
+        with pytest.raises(LightError, match="of /new must not be negative"):
+            lights.add("/new", LightKind.RECT, **{"to_world": down(0, 0, 0), "radiance": (1, 1, 1), **change})
+    for change in ({"size": "wide"}, {"size": 5}, {"radiance": (1, (2, 3))}, {"to_world": np.eye(3)}):
+        with pytest.raises(LightError, match="of /rect needs finite numbers"):
+            lights.change(0, **change)
+    for image in ("x.exr", np.ones((4, 8)), ((1, 2), (3,))):
+        with pytest.raises(LightError, match="image of"):
+            lights.change(2, texture=image)
+    assert lights.revision == before[1] and len(lights.paths) == 4
+    np.testing.assert_array_equal(lights.gains, before[0])
+    for now, then in zip(lights.snapshot().lights, before[2], strict=True):
+        np.testing.assert_array_equal(now, then)
     with pytest.raises(LightError, match="can't be added live"):
         lights.add("/m", LightKind.MESH, to_world=down(0, 0, 0), radiance=(1, 1, 1))
 
@@ -189,3 +208,14 @@ def test_a_new_image_replaces_the_old_one(scene: Pipeline) -> None:
     plain = settle(build(scene, room(RECT, SPHERE, replace(DOME, image=Image(image)))))
     np.testing.assert_array_equal(lights.view_direct[2], plain.view_direct[2])
     np.testing.assert_array_equal(lights.snapshot().lights.texture, [-1, -1, 1, -1])
+
+
+def test_a_camera_that_sees_no_surface_needs_no_light() -> None:
+    away = look_at((0, 5, 0), (0, 9, 0.1), width=4, height=4)
+    snapshot = make_snapshot(cornell_meshes(), camera=away, lights=[Light(LightKind.DOME, 1.0), RECT])
+    pipeline = Pipeline(snapshot, n_gather=30, bounce_rays=16)
+    assert pipeline.view.n == 0
+    lights = settle(build(pipeline))
+    assert lights.view_direct.shape == (2, 0, 3)
+    lights.change(0, to_world=down(0, 0, 0))
+    settle(lights)
