@@ -15,7 +15,7 @@ from icheat_usd.transport.packed import LargeTerms, PackedLobe, PackedRows, Pack
 from icheat_usd.transport.packing import lossless, pack
 from icheat_usd.transport.progressive import build_transports
 from icheat_usd.transport.records import RecordSettings
-from icheat_usd.transport.residual import residual, residual_in_steps
+from icheat_usd.transport.residual import residual
 from icheat_usd.transport.sparse import SparseRows
 from icheat_usd.transport.training import training_radiance
 
@@ -39,7 +39,6 @@ __all__ = [
     "lossless",
     "pack",
     "residual",
-    "residual_in_steps",
     "solve_bounces",
     "sum_groups",
     "sum_lights",

@@ -96,7 +96,6 @@ def pack(
     training: F32,
     tolerance: float = 0.015,
     *,
-    max_bytes: int | None = None,
     progress: Progress = silent,
 ) -> PackedTransport:
     """Keep of each tile of rows the coefficients that matter to plausible lights, in 8 bits.
@@ -114,8 +113,6 @@ def pack(
         Radiance that plausible lights make leave the cells.
     tolerance
         Relative RMS error at the records, median over such lights.
-    max_bytes
-        Stop here even where the tolerance asks for more.
 
     Raises
     ------
@@ -126,7 +123,7 @@ def pack(
     -----
     Bitwise the same for any number of threads.
     """
-    return pack_on_tree(transport, gather.tree, training, tolerance, max_bytes=max_bytes, progress=progress)
+    return pack_on_tree(transport, gather.tree, training, tolerance, progress=progress)
 
 
 def pack_on_tree(
@@ -135,7 +132,6 @@ def pack_on_tree(
     training: F32,
     tolerance: float,
     *,
-    max_bytes: int | None = None,
     progress: Progress = silent,
 ) -> PackedTransport:
     """`pack` for whoever has no more of the gather samples than their tree."""
@@ -149,7 +145,7 @@ def pack_on_tree(
     weighted = [_weigh(lobe, transport.interpolation, training) for lobe in transport.lobes]
     weighted, light = _normalise(tree, training, weighted)
     packer = _Packer(tree)
-    least, light_error = _find_least(packer, weighted, light, tolerance, max_bytes, progress)
+    least, light_error = _find_least(packer, weighted, light, tolerance, progress)
     lobes = []
     n_tiles = sum(_n_tiles(part.rows) for part in weighted if part.rows.n_entries)
     done = 0
@@ -226,7 +222,6 @@ def _find_least(
     weighted: list[_Weighted],
     light: kernels.Light,
     tolerance: float,
-    max_bytes: int | None,
     progress: Progress,
 ) -> tuple[float, F64]:
     """Least worth of a coefficient, and the errors (n_lights,) that it makes.
@@ -248,17 +243,14 @@ def _find_least(
     least = tolerance**2 * _FIRST_LEAST / sum(_n_tiles(part.rows) for part, _ in parts)
     tried: list[tuple[float, float, F64]] = []  # logarithms of a worth and of error / tolerance, and errors
     for trial in range(_TRIALS):
-        squared, size = np.zeros(n_lights), 0.0
+        squared = np.zeros(n_lights)
         for part, tiles in parts:
             share = _n_tiles(part.rows) / len(tiles)
             for known, trained, others in zip(of_half, halves, reversed(halves), strict=True):
-                error, n_kept = _try(packer, part, light, known, trained, others, tiles, least)
+                error = _try(packer, part, light, known, trained, others, tiles, least)
                 squared[others] += share * error
-                size += 0.5 * share * n_kept * (LANES + 8)
         errors = np.sqrt(squared[lit] / total[lit])
         ratio = max(PackingReport(errors).error / tolerance, 1e-12)
-        if max_bytes is not None:  # fewer bytes for a larger worth: the same search serves both limits
-            ratio = min(ratio, max_bytes / size)
         tried.append((float(np.log(least)), float(np.log(ratio)), errors))
         progress("choose coefficients", (trial + 1) / _TRIALS)
         if 1 / _CLOSE_ENOUGH < ratio < _CLOSE_ENOUGH:
@@ -278,10 +270,10 @@ def _try(
     others: I64,
     tiles: I64,
     least: float,
-) -> tuple[F64, int]:
-    """Squared errors of the lights `others` in some tiles packed by the lights `trained`, and entries kept."""
+) -> F64:
+    """Squared errors of the lights `others` in some tiles packed by the lights `trained`."""
     of_half = part._replace(response=np.ascontiguousarray(part.response[:, trained]))
-    squared, n_kept = np.zeros(len(others)), 0
+    squared = np.zeros(len(others))
     unknown = np.ascontiguousarray(light.coefficients[:, others])
     for first in range(0, len(tiles), _TILES_AT_ONCE):
         some = tiles[first : first + _TILES_AT_ONCE]
@@ -289,8 +281,7 @@ def _try(
         exact = _part_of_tiles(part, some)
         product = packed.multiply(unknown)[: len(exact.row_weight)]
         squared += np.square(exact.row_weight) @ np.square((product - exact.response[:, others]).astype(np.float64))
-        n_kept += len(packed.index)
-    return squared, n_kept
+    return squared
 
 
 def _next_trial(tried: list[tuple[float, float]]) -> float:
@@ -339,12 +330,9 @@ def _sparse_tiles(part: _Weighted) -> kernels.SparseTiles:
 
 
 def _join(tree: ClusterTree, n_rows: int, tiles: list[_Tile]) -> PackedRows:
-    if not tiles:
-        tiles = [
-            _Tile(
-                np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32), np.empty((0, LANES), np.int8)
-            )
-        ] * (-(-n_rows // LANES))
+    none = _Tile(np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32), np.empty((0, LANES), np.int8))
+    tiles = tiles or [none] * -(-n_rows // LANES)
     begin = _begin(np.array([len(tile.coefficient) for tile in tiles], np.int64))
-    index, scale, worth, value = (np.concatenate([tile[k] for tile in tiles]) for k in range(4))
+    # with an empty one, since a camera that sees no surface has no tiles
+    index, scale, worth, value = (np.concatenate([none[k], *(tile[k] for tile in tiles)]) for k in range(4))
     return PackedRows(tree, n_rows, begin, index, scale, worth, value)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from icheat_usd.samples.wavelets import haar_forward
@@ -30,19 +28,9 @@ def residual(transport: PackedTransport, radiance: F32) -> list[F32]:
     ValueError
         The exact rows were not kept.
     """
-    out = [np.zeros((lobe.rows.n_rows, 3), np.float32) for lobe in transport.lobes]
-    for _ in residual_in_steps(transport, radiance, out):
-        pass
-    return out
-
-
-def residual_in_steps(transport: PackedTransport, radiance: F32, out: list[F32]) -> Iterator[float]:
-    """`residual` into `out`, step by step; yields the share that is done.
-
-    A step takes milliseconds, so that something else can go on between steps.
-    """
     if transport.source is None:
         raise ValueError("a packed transport without its exact rows does not know what it lost")
+    out = [np.zeros((lobe.rows.n_rows, 3), np.float32) for lobe in transport.lobes]
     coefficients = haar_forward(transport.lobes[0].rows.tree, radiance).astype(np.float32)
     exact = [lobe.rows for lobe in transport.source.lobes]
     n_tiles = transport.lobes[0].rows.n_tiles
@@ -53,4 +41,4 @@ def residual_in_steps(transport: PackedTransport, radiance: F32, out: list[F32])
                 some = slice(first * LANES, min(last * LANES, rows.n_rows))
                 product = lobe.rows.tiles(first, last).multiply(coefficients)
                 lost[some] = rows.rows(some.start, some.stop).matmul(radiance) - product
-        yield last / n_tiles
+    return out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
@@ -109,12 +111,14 @@ def test_uniform_light_stays_right_however_little_is_kept(scene: tuple[ClusterTr
     assert error(packed, transport, np.ones(N_LEAVES, np.float32)) < 5e-5
 
 
-def test_no_more_bytes_than_allowed(scene: tuple[ClusterTree, F32, Transport]) -> None:
+def test_no_rows_are_packed_to_nothing(scene: tuple[ClusterTree, F32, Transport]) -> None:
     tree, position, transport = scene
-    training = lights(position, 8, 2)
-    free = pack_on_tree(transport, tree, training, 0.01)
-    bound = pack_on_tree(transport, tree, training, 0.01, max_bytes=free.n_bytes // 3)
-    assert free.n_bytes // 8 < bound.n_bytes < free.n_bytes // 2
+    (lobe,) = transport.lobes
+    none = replace(transport, lobes=(replace(lobe, rows=lobe.rows.rows(0, 0), tint=lobe.tint[:0]),))
+    packed = pack_on_tree(replace(none, row_view=none.row_view[:0]), tree, lights(position, 8, 2), 0.01)
+    assert len(packed.lobes[0].rows.index) == 0
+    b = np.ones((N_LEAVES, 3), np.float32)
+    assert packed.lobes[0].rows.matmul(b).shape == (0, 3)
 
 
 def test_residual_makes_a_light_exact(scene: tuple[ClusterTree, F32, Transport]) -> None:
