@@ -24,7 +24,6 @@ from icheat_usd.kernels.embree import call_1, call_packet
 from icheat_usd.kernels.locate import nearest_sample
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 from icheat_usd.kernels.samples import basis, cosine_direction, cosine_lobe
-from icheat_usd.kernels.sky import octahedral_bin
 
 BATCH = 4096  # rays that are put in order of direction; their buffers fit the second-level cache
 NOTHING = -1  # key of a ray that ends nowhere: below its surface, or on a degenerate triangle
@@ -89,7 +88,12 @@ def fill_directions(shading_normal, normal, i, first, last, row_seed, at, x, y, 
 def fill_row(  # type: ignore[no-untyped-def]
     shading_normal, normal, begin, end, first, n, of_rays, row_seed, at, origin, x, y, z
 ):
-    """Rays ``first:first + n`` of a row: point of each, and direction. The row has points ``begin:end``."""
+    """Rays ``first:first + n`` of a row, of `of_rays` in all. The row has points ``begin:end``.
+
+    `shading_normal` and `normal` are (n_points, 3) float32. Out, from entry `at`
+    on: number of the point `origin` (room,) int64, and direction `x`, `y`, `z`
+    (room,) float32 each.
+    """
     points = end - begin
     k = first
     while k < first + n:
@@ -102,11 +106,30 @@ def fill_row(  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _octahedral_bin(x, y, z, n):  # type: ignore[no-untyped-def]
+    """Bin of a direction of any length in an n by n grid, row by row; y is up, in the middle of the square.
+
+    Cigolle et al. 2014, A Survey of Efficient Representations for Independent Unit Vectors, JCGT 3(2).
+    """
+    total = abs(x) + abs(y) + abs(z)
+    scale = np.float32(0.5) / max(total, np.float32(1e-30))
+    a, b = x * scale, z * scale
+    half = np.float32(0.5)
+    folded_a = half - abs(b)
+    folded_b = half - abs(a)
+    if y < np.float32(0.0):
+        a, b = (folded_a if a >= np.float32(0.0) else -folded_a), (folded_b if b >= np.float32(0.0) else -folded_b)
+    column = min(max(np.int32((a + half) * np.float32(n)), np.int32(0)), np.int32(n - 1))
+    row = min(max(np.int32((b + half) * np.float32(n)), np.int32(0)), np.int32(n - 1))
+    return row * np.int32(n) + column
+
+
+@kernel
 def _order_by_direction(n, x, y, z, bin_of, bin_begin, order):  # type: ignore[no-untyped-def]
     """Rays in order of direction, bin by bin; those without a direction are left out. Returns how many there are."""
     bin_begin[:] = 0
     for e in range(n):
-        bin_of[e] = octahedral_bin(x[e], y[e], z[e], _BINS)
+        bin_of[e] = _octahedral_bin(x[e], y[e], z[e], _BINS)
     for e in range(n):
         if not abs(x[e]) + abs(y[e]) + abs(z[e]) > np.float32(0.0):
             bin_of[e] = _BINS * _BINS
@@ -160,8 +183,6 @@ def count_hits(  # type: ignore[no-untyped-def]
     first_ray,
     n_rays,
     of_rays,
-    n_cells,
-    sky_bins,
     counter,
     mark,
     count,
@@ -170,12 +191,32 @@ def count_hits(  # type: ignore[no-untyped-def]
     n_detours,
     detour,
 ):
-    """How many rays of each row end in each cell or, leaving the scene, in each bin of the sky.
+    """How many rays of each row end in each cell; keys are cells, and ascend.
 
-    Keys are cells, then ``n_cells +`` bins, and ascend. `detour` (n_rows, n_rays)
-    lists the rays that end on triangles which do not simply reflect.
-    `counter` (n_lanes, n_keys) and `mark` (n_lanes, n_keys / 64) are zero before
-    and after; a lane's rows are worked on by one thread.
+    A lane's rows are worked on by one thread, so that sums do not depend on the threads.
+
+    Parameters
+    ----------
+    trace, cells, locator : TraceTable, CellTable and table of the locator
+    depth : int
+        Of the locator's tree.
+    points : (n_triangles, 3, 3) float32
+        Corners, object space.
+    to_world, to_object : (n_instances, 3, 4) float32
+    triangle_route : (n_triangles,) uint8
+        1: a hit must be looked at more closely.
+    position, shading_normal, normal : (n_points, 3) float32
+        Starts in world space, metres, off the surface; unit normals.
+    point_begin : (n_rows + 1,) int64
+    stream : (n_rows,) int64
+    seed, first_ray, n_rays, of_rays : int
+        Rays ``first_ray:first_ray + n_rays`` of sequences of `of_rays`.
+    counter : (n_lanes, n_cells) int32, mark : (n_lanes, n_cells / 64) uint64
+        Zero before and after.
+    count : (n_rows,) int64, out_key, out_hits : (n_rows, room) int32
+        Out: number of cells met; the cells; the rays that end in each.
+    n_detours : (n_rows,) int64, detour : (n_rows, n_rays) int32
+        Out: the rays that end on triangles which do not simply reflect.
     """
     n_rows = len(stream)
     together = max(1, BATCH // n_rays)  # rows whose rays are ordered together
@@ -260,8 +301,6 @@ def count_hits(  # type: ignore[no-untyped-def]
                         entries[k] = NOTHING
                         listed[k] = 0
                         if words[18, k] == _INVALID:
-                            if sky_bins > 0:
-                                entries[k] = n_cells + octahedral_bin(x[e], y[e], z[e], sky_bins)
                             continue
                         i, t = instances[k], triangles[k]
                         if triangle_route[t] != 0:

@@ -120,22 +120,3 @@ def add_shares(  # type: ignore[no-untyped-def]
                 total += np.rint(np.float64(weight_b[b]) * of_b)
                 b += 1
             weight[e] = total / of_out
-
-
-@parallel_kernel
-def count_below(indptr, index, column, out):  # type: ignore[no-untyped-def]
-    """Entries of each row whose column is less than `column`."""
-    for r in prange(len(out)):
-        e = indptr[r]
-        while e < indptr[r + 1] and index[e] < column:
-            e += 1
-        out[r] = e - indptr[r]
-
-
-@parallel_kernel
-def copy_part(begin, first_column, index, weight, indptr_out, index_out, weight_out):  # type: ignore[no-untyped-def]
-    """Entries from ``begin[r]`` on of each row, as many as the output has, columns counted from `first_column`."""
-    for r in prange(len(begin)):
-        for e in range(indptr_out[r + 1] - indptr_out[r]):
-            index_out[indptr_out[r] + e] = index[begin[r] + e] - first_column
-            weight_out[indptr_out[r] + e] = weight[begin[r] + e]

@@ -2,7 +2,7 @@
 
 from icheat_usd.lighting.direct import irradiance, reflected_direct, samples_per_light
 from icheat_usd.lighting.environment import environment_radiance, environment_radiance_per_light
-from icheat_usd.lighting.sampler import LightSampler, build_light_sampler, total_power
+from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
 
 __all__ = [
     "LightSampler",
@@ -12,5 +12,4 @@ __all__ = [
     "irradiance",
     "reflected_direct",
     "samples_per_light",
-    "total_power",
 ]

@@ -15,7 +15,6 @@ from icheat_usd.samples import GatherSamples, cell_direct
 from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport.rays import RowBuilder
-from icheat_usd.transport.sky import SkyBins
 from icheat_usd.transport.sparse import SparseRows
 
 _CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
@@ -27,7 +26,6 @@ class Bounces:
 
     rows: SparseRows  #: (n_gather x n_gather) form factors without albedo; row sums at most 1
     albedo: F32  #: (n_gather, 3) mean reflectance of the cells
-    sky: SparseRows | None = None  #: (n_gather x bins) rays of the cells that leave the scene, where asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +64,8 @@ def build_bounces(
     rays_per_row: int = 256,
     seed: int = 0,
     progress: Progress = silent,
-    sky: SkyBins | None = None,
 ) -> Bounces:
-    """Measure with gather rays what the cells receive from each other, and from bins of the sky if these are given.
+    """Measure with gather rays what the cells receive from each other.
 
     Rays start from the patch points, so that a row is the mean over its cell.
     """
@@ -81,11 +78,10 @@ def build_bounces(
         1,
         progress,
         "bounce rays",
-        sky=sky,
     )
     albedo = np.empty((gather.n, 3), np.float32)
     row_kernels.mean_over_segments(gather.cell_begin, effective_albedo(gather.patch_points), albedo)
-    return Bounces(rows.cells, albedo, rows.sky if sky else None)
+    return Bounces(rows.cells, albedo)
 
 
 def solve_bounces(bounces: Bounces, direct: F32, n_bounces: int) -> F32:

@@ -49,8 +49,7 @@ class Pieces:
         if len(found) == 1:
             return found[0]
         cells = concatenate_rows([part.cells for part in found], found[0].cells.n_columns)
-        sky = concatenate_rows([part.sky for part in found], found[0].sky.n_columns)
-        return MeasuredRows(cells, sky, n_rays)
+        return MeasuredRows(cells, n_rays)
 
     def both(
         self, samples: I64, n_rays: int, make: Callable[[I64], tuple[SparseRows, SparseRows]]

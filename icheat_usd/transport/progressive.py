@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from icheat_usd.errors import IcheatError
 from icheat_usd.kernels.rows import place_rows
 from icheat_usd.materials import is_glossy, take_points
 from icheat_usd.progress import Progress, silent
@@ -16,7 +17,7 @@ from icheat_usd.tracing import Tracer
 from icheat_usd.transport.build import Lobe, Transport
 from icheat_usd.transport.outliers import Survey, add_outliers
 from icheat_usd.transport.pieces import PartStore, Pieces
-from icheat_usd.transport.rays import MeasuredRows, RowBuilder
+from icheat_usd.transport.rays import MOST_RAYS, MeasuredRows, RowBuilder
 from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
 from icheat_usd.transport.sparse import SparseRows, concatenate_rows
 
@@ -50,7 +51,7 @@ def build_transports(
     training : (n_lights, n_gather) float32
         What plausible lights make leave the cells: `training_radiance`.
     rays_per_row
-        Of the last transport, per record and lobe.
+        Of the last transport, per record and lobe; at most `MOST_RAYS`.
     parts
         Where rows that were traced before are found, and those that are traced now are kept.
 
@@ -61,10 +62,17 @@ def build_transports(
         they move slowly over a surface instead of from record to record; then
         with rays of their own. Rows are in the order of `tile_order`.
 
+    Raises
+    ------
+    IcheatError
+        `rays_per_row` is too large.
+
     Notes
     -----
     Bitwise the same for any number of threads.
     """
+    if rays_per_row > MOST_RAYS:
+        raise IcheatError(f"{rays_per_row} gather rays a row are more than records can have; take {MOST_RAYS} at most")
     builder = RowBuilder(snapshot, tracer, gather, seed)
     lights = np.ascontiguousarray(training.T)
     share = _scalar(view.throughput) * np.float32(

@@ -18,12 +18,13 @@ from icheat_usd.materials import sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, I32, I64, U8, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import Tracer, first_surfaces, spawn_points, transmittance
-from icheat_usd.transport.sky import SkyBins
-from icheat_usd.transport.sparse import SparseRows, add_shares, concatenate_rows, split_columns
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
+from icheat_usd.transport.sparse import SparseRows, add_shares, concatenate_rows
 
 _RAYS_AT_ONCE = 1 << 20
 _UNITS = 1024  # of a ray: counts stay whole numbers where mirrors and glass let part of its light through
+#: Of a row that is measured in parts: float32 shares give back counts of units below 2^23.
+MOST_RAYS = (1 << 23) // _UNITS
 _LANES_PER_THREAD = 4  # few lanes are few counters, several even out the rows' cost
 _DETOUR_DEPTH = 8  # mirrors and faces of glass on a gather ray: what is trapped for longer is darkness to the row
 _WEAK_SPECULAR = 0.2  # reflectance at normal incidence; dielectrics have 0.02 to 0.17
@@ -44,16 +45,22 @@ class MeasuredRows(NamedTuple):
     """Where the rays of rows end, as shares of `n_rays`."""
 
     cells: SparseRows  #: (n_rows x n_gather)
-    sky: SparseRows  #: (n_rows x bins) rays that leave the scene; without entries where no sky was asked for
     n_rays: int
 
     def continued(self, more: MeasuredRows) -> MeasuredRows:
-        """These rows and further rays of the same rows: the same, bit for bit, as all rays measured at once."""
+        """These rows and further rays of the same rows: the same, bit for bit, as all rays measured at once.
+
+        Raises
+        ------
+        ValueError
+            More than `MOST_RAYS` in all, whose counts float32 could not hold.
+        """
+        n_rays = self.n_rays + more.n_rays
+        if n_rays > MOST_RAYS:
+            raise ValueError(f"{n_rays} gather rays a row are too many to add up exactly; at most {MOST_RAYS}")
         before, after = self.n_rays * _UNITS, more.n_rays * _UNITS
-        cells, sky = (
-            add_shares(a, before, b, after, before + after) for a, b in ((self.cells, more.cells), (self.sky, more.sky))
-        )
-        return MeasuredRows(cells, sky, self.n_rays + more.n_rays)
+        cells = add_shares(self.cells, before, more.cells, after, before + after)
+        return MeasuredRows(cells, n_rays)
 
 
 class RowBuilder:
@@ -89,9 +96,8 @@ class RowBuilder:
         *,
         first_ray: int = 0,
         of_rays: int | None = None,
-        sky: SkyBins | None = None,
     ) -> MeasuredRows:
-        """Rows of cosine-distributed rays, and where in the sky the rays end that leave the scene.
+        """Rows of cosine-distributed rays.
 
         Parameters
         ----------
@@ -105,9 +111,6 @@ class RowBuilder:
             Rays ``first_ray:first_ray + n_rays`` of the sequence are traced; see `MeasuredRows.continued`.
         of_rays
             How many there will be in all, over which the points of a row are spread.
-        sky
-            Bins for rays that leave the scene. Glass and cut-outs on the way let them through straight, as
-            they do with direct light.
 
         Notes
         -----
@@ -127,29 +130,25 @@ class RowBuilder:
         )
         table = self._trace_table()
         lookup = self._hit_cells.table(self._snapshot.geometry, len(stream) * n_rays)
-        n_keys = self._gather.n + (sky.n if sky else 0)
-        counter = _Counter(n_keys)
+        counter = _Counter(self._gather.n)
 
         def row_chunk(first: int, last: int) -> SparseRows:
             part = rays.rows(first, last)
             if table is not None:
-                return self._count_hits(table, lookup, part, sky, counter)
+                return self._count_hits(table, lookup, part, counter)
             n = last - first
             row, ray = np.repeat(np.arange(n), n_rays), np.tile(np.arange(first_ray, first_ray + n_rays), n)
-            return _counted(row, *self._ends(part, row, ray, sky), n, n_keys)
+            return _counted(row, *self._ends(part, row, ray), n, self._gather.n)
 
-        units = self._in_chunks(len(stream), n_rays, row_chunk, progress, step, n_columns=n_keys)
+        units = self._in_chunks(len(stream), n_rays, row_chunk, progress, step)
         kernels.divide(units.weights, float(_UNITS * n_rays))
-        cells, in_sky = split_columns(units, self._gather.n)
-        return MeasuredRows(cells, in_sky, n_rays)
+        return MeasuredRows(units, n_rays)
 
     def _trace_table(self) -> TraceTable | None:
         return self._tracer.compiled()
 
-    def _count_hits(
-        self, trace: TraceTable, lookup: CellTable, rays: _Rays, sky: SkyBins | None, counter: _Counter
-    ) -> SparseRows:
-        """Units of light that arrive from cells and, in columns behind them, bins of the sky."""
+    def _count_hits(self, trace: TraceTable, lookup: CellTable, rays: _Rays, counter: _Counter) -> SparseRows:
+        """Units of light that arrive from cells."""
         geometry, gather = self._snapshot.geometry, self._gather
         n = len(rays.stream)
         count, n_detours = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -173,8 +172,6 @@ class RowBuilder:
             rays.first_ray,
             rays.n_rays,
             rays.of_rays,
-            gather.n,
-            sky.resolution if sky else 0,
             counter.count,
             counter.mark,
             count,
@@ -192,12 +189,10 @@ class RowBuilder:
         ray = np.empty(begin[-1], np.int32)
         row_kernels.pack_ints(n_detours, begin, detour, ray)
         row = np.repeat(np.arange(n), n_detours)
-        ends = self._ends(rays, row, ray, sky, all_detour=True)
+        ends = self._ends(rays, row, ray, all_detour=True)
         return add_shares(rows, 1, _counted(row, *ends, n, counter.n_keys), 1, 1)
 
-    def _ends(
-        self, rays: _Rays, row: I64, ray: I32 | I64, sky: SkyBins | None, all_detour: bool = False
-    ) -> tuple[I64, I64, I64]:
+    def _ends(self, rays: _Rays, row: I64, ray: I32 | I64, all_detour: bool = False) -> tuple[I64, I64, I64]:
         """Where some rays end: number of the ray in `row`, column and units of light.
 
         `all_detour`: each of them is known to meet a surface that does not simply reflect.
@@ -228,13 +223,6 @@ class RowBuilder:
         which = np.flatnonzero(cell >= 0)
         units = np.full(n, _UNITS) if weight is None else np.rint(weight * np.float32(_UNITS)).astype(np.int64)
         column, units = cell[which].astype(np.int64), units[which]
-        if sky is not None:
-            open_rays = np.flatnonzero(directions.any(axis=1))
-            share = transmittance(self._snapshot, self._tracer, origins[open_rays], directions[open_rays]).mean(axis=1)
-            bins = self._gather.n + sky.of_directions(directions[open_rays]).astype(np.int64)
-            which = np.concatenate([which, open_rays])
-            column = np.concatenate([column, bins])
-            units = np.concatenate([units, np.rint(share * np.float32(_UNITS)).astype(np.int64)])
         return which, column, units
 
     def specular_rows(
@@ -291,7 +279,6 @@ class RowBuilder:
         progress: Progress,
         step: str,
         rays_at_once: int = _RAYS_AT_ONCE,
-        n_columns: int | None = None,
     ) -> SparseRows:
         parts = []
         at_once = max(1, rays_at_once // n_rays)
@@ -300,7 +287,7 @@ class RowBuilder:
             last = min(first + at_once, n_rows)
             parts.append(row_chunk(first, last))
             progress(step, last / n_rows)
-        return concatenate_rows(parts, n_columns or self._gather.n)
+        return concatenate_rows(parts, self._gather.n)
 
     def _cells(self, origins: F32, directions: F32, counters: I32, seed: int) -> tuple[I32, F32 | None]:
         """Cell that each ray ends in and its throughput; None for the throughput where it is 1 for all."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from icheat_usd.lighting import build_light_sampler, irradiance, total_power
+from icheat_usd.lighting import build_light_sampler, irradiance
 from icheat_usd.scene import LightKind, SceneSnapshot, SurfacePoints, Texture
 from icheat_usd.tracing import build_tracer
 from tests.lighting import naive
@@ -325,21 +325,6 @@ def test_a_scene_scaled_as_a_whole_receives_the_same_light(scale: float) -> None
 
 def test_no_lights_at_all_is_an_empty_table() -> None:
     assert irradiance_at(scene(), naive.receivers((0, 0, 0), UP)).shape == (0, 1, 3)
-
-
-def test_power_is_area_times_pi_times_radiance() -> None:
-    stretch = scaling(2, 3, 5)
-    snapshot = scene(
-        Light(LightKind.RECT, (1, 2, 3), stretch, (1, 1)),
-        Light(LightKind.SPHERE, 1.0, scaling(2), (0.5, 0)),
-        Light(LightKind.CYLINDER, 1.0, scaling(1, 2, 2), (0.5, 3)),
-        meshes=(lamp(1.0, transform=stretch),),
-    )
-    power = total_power(snapshot, build_light_sampler(snapshot))
-    np.testing.assert_allclose(power[0], np.pi * 6 * np.array([1, 2, 3]), rtol=1e-6)
-    assert power[1, 0] == pytest.approx(np.pi * 4 * np.pi, rel=1e-4)
-    assert power[2, 0] == pytest.approx(np.pi * 2 * np.pi * 1 * 3, rel=1e-4)
-    assert power[3, 0] == pytest.approx(2 * np.pi * 6 * 0.7, rel=1e-5)
 
 
 def test_inside_a_closed_shining_box_every_wall_receives_pi() -> None:

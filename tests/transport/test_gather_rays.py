@@ -1,4 +1,4 @@
-"""Rows measured in one compiled pass: the same as by separate steps, in parts, with the sky, and exact cells."""
+"""Rows measured in one compiled pass: the same as by separate steps, in parts, and exact cells."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numba
 import numpy as np
 import pytest
 
+from icheat_usd.errors import IcheatError
 from icheat_usd.kernels import cell_map as cell_kernels
 from icheat_usd.kernels.random import sobol_pair
-from icheat_usd.kernels.transport import cells_of_hits
+from icheat_usd.kernels.transport import cells_of_hits, divide
 from icheat_usd.materials import points_on_surface, take_points
 from icheat_usd.samples import GatherSamples, gather_samples, view_samples
 from icheat_usd.samples.cell_map import HitCells, build_cell_map
@@ -19,8 +20,9 @@ from icheat_usd.samples.view import ViewSamples
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import SparseRows
-from icheat_usd.transport.rays import MeasuredRows, RowBuilder
-from icheat_usd.transport.sky import SkyBins
+from icheat_usd.transport.progressive import build_transports
+from icheat_usd.transport.rays import MOST_RAYS, MeasuredRows, RowBuilder
+from icheat_usd.transport.sparse import add_shares
 from tests.scenes import (
     Material,
     Mesh,
@@ -34,8 +36,6 @@ from tests.scenes import (
     sphere,
     translation,
 )
-
-SKY = SkyBins(8)
 
 
 class Apart(RowBuilder):
@@ -82,18 +82,15 @@ def measure(
     open_scene: bool = True,
     cells: bool = False,
     rows: slice = slice(None),
-    sky: SkyBins | None = SKY,
     **options: int,
 ) -> MeasuredRows:
     scene, tracer, view, gather = prepared(open_scene)
     builder = kind(scene, tracer, gather, 3)
     if cells:
-        return builder.measure(
-            gather.patch_points, gather.cell_begin, np.arange(gather.n), n_rays, 1, sky=sky, **options
-        )
+        return builder.measure(gather.patch_points, gather.cell_begin, np.arange(gather.n), n_rays, 1, **options)
     stream = np.arange(view.n)[rows]
     begin = np.arange(len(stream) + 1)
-    return builder.measure(take_points(view.points, stream), begin, stream, n_rays, 0, sky=sky, **options)
+    return builder.measure(take_points(view.points, stream), begin, stream, n_rays, 0, **options)
 
 
 def assert_same(a: SparseRows, b: SparseRows) -> None:
@@ -104,7 +101,6 @@ def assert_same(a: SparseRows, b: SparseRows) -> None:
 
 def assert_all_same(a: MeasuredRows, b: MeasuredRows) -> None:
     assert_same(a.cells, b.cells)
-    assert_same(a.sky, b.sky)
 
 
 # Rays exactly between two triangles may be given to either by packets and single rays; none is in these scenes.
@@ -113,7 +109,7 @@ def assert_all_same(a: MeasuredRows, b: MeasuredRows) -> None:
 def test_one_pass_gives_the_rows_of_separate_steps(open_scene: bool, n_rays: int) -> None:
     rows = slice(0, None, 1 if n_rays < 1000 else 9)
     one = measure(n_rays=n_rays, open_scene=open_scene, rows=rows)
-    assert one.cells.n_entries > 0 and one.sky.n_entries > 0
+    assert one.cells.n_entries > 0
     assert_all_same(one, measure(Apart, n_rays, open_scene=open_scene, rows=rows))
 
 
@@ -139,7 +135,7 @@ def test_scenes_of_many_placements_are_traced_ray_by_ray() -> None:
     gather = gather_samples(scene, tracer, view, n=700)
     stream = np.arange(view.n)
     found = [
-        kind(scene, tracer, gather, 0).measure(view.points, np.arange(view.n + 1), stream, 40, 0, sky=SKY)
+        kind(scene, tracer, gather, 0).measure(view.points, np.arange(view.n + 1), stream, 40, 0)
         for kind in (RowBuilder, Apart)
     ]
     assert_all_same(*found)
@@ -151,7 +147,7 @@ def test_the_reference_tracer_finds_nearly_the_same_rows() -> None:
     stream = np.arange(0, view.n, 7)
     points = take_points(view.points, stream)
     a = slow.measure(points, np.arange(len(stream) + 1), stream, 64, 0)
-    b = measure(n_rays=64, open_scene=False, rows=slice(0, None, 7), sky=None)
+    b = measure(n_rays=64, open_scene=False, rows=slice(0, None, 7))
     dense = [np.zeros(a.cells.shape, np.float32) for _ in range(2)]
     for out, rows in zip(dense, (a.cells, b.cells), strict=True):
         out[np.repeat(np.arange(rows.n_rows), np.diff(rows.indptr)), rows.indices] = rows.weights
@@ -168,13 +164,33 @@ def test_rays_in_parts_are_the_rays_at_once() -> None:
     assert_all_same(whole, parts[0].continued(parts[1]))
 
 
+def test_rays_in_parts_are_exact_up_to_the_most_and_more_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    units, n = 1024, 4000
+    of_a, of_b = 3000 * units, (MOST_RAYS - 3000) * units
+    a, b = (rng.integers(1, of, n, endpoint=True) for of in (of_a, of_b))
+    a[:2], b[:2] = (of_a, of_a - 1), (of_b, of_b - 1)
+
+    def shares(count: np.ndarray, of: int) -> SparseRows:
+        weights = count.astype(np.float32)
+        divide(weights, float(of))
+        return SparseRows(np.arange(n + 1), np.zeros(n, np.int32), weights, 1)
+
+    assert_same(add_shares(shares(a, of_a), of_a, shares(b, of_b), of_b, of_a + of_b), shares(a + b, of_a + of_b))
+    scene, tracer, view, gather = prepared(False)
+    with pytest.raises(IcheatError, match="8193 gather rays a row are more"):
+        next(build_transports(scene, tracer, view, gather, np.ones((2, gather.n), np.float32), rays_per_row=8193))
+    nothing = SparseRows.empty(1, 1)
+    with pytest.raises(ValueError, match="too many"):
+        MeasuredRows(nothing, MOST_RAYS).continued(MeasuredRows(nothing, 1))
+
+
 def test_a_row_does_not_depend_on_the_rows_beside_it() -> None:
     whole = measure(n_rays=64)
     some = measure(n_rays=64, rows=slice(5, None, 11))
     for row in range(some.cells.n_rows):
         at = 5 + 11 * row
         assert_same(some.cells.rows(row, row + 1), whole.cells.rows(at, at + 1))
-        assert_same(some.sky.rows(row, row + 1), whole.sky.rows(at, at + 1))
 
 
 def test_rows_are_the_same_for_any_number_of_threads() -> None:
@@ -184,40 +200,6 @@ def test_rows_are_the_same_for_any_number_of_threads() -> None:
         found.append(measure(n_rays=300))
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert_all_same(*found)
-
-
-def test_the_sky_above_a_lone_floor_is_a_cosine() -> None:
-    scene = make_snapshot([Mesh(quad(2))], camera=look_at((0, 2, 1), width=4, height=4))
-    tracer = build_tracer(scene)
-    view = view_samples(scene, tracer)
-    gather = gather_samples(scene, tracer, view, n=20)
-    builder = RowBuilder(scene, tracer, gather, 0)
-    n_rays = 8192
-    found = builder.measure(view.points, np.arange(view.n + 1), np.arange(view.n), n_rays, 0, sky=SKY)
-    assert found.cells.n_entries == 0
-    np.testing.assert_allclose(found.sky.row_sums(), 1, rtol=1e-6)
-    dense = found.sky.matmul(np.eye(SKY.n, dtype=np.float32)).mean(axis=0)
-    fine = SkyBins(256)
-    form_factor = np.bincount(
-        SKY.of_directions(fine.direction), np.maximum(fine.direction[:, 1], 0) * fine.solid_angle / np.pi, SKY.n
-    )
-    error = 5 * np.sqrt(form_factor / (n_rays * view.n))
-    assert np.all(np.abs(dense - form_factor) <= error + 0.005 * form_factor.max())
-
-
-def test_glass_lets_the_sky_through_straight_as_direct_light_does() -> None:
-    glass = Material(diffuse=0.0, roughness=0.0, opacity=0.0, ior=1.5)
-    lid = Mesh(quad(1e4), glass, transforms=[translation(0, 1, 0)], path="/pane")
-    scene = make_snapshot([Mesh(quad(2)), lid], camera=look_at((0, 0.9, 0.5), width=4, height=4))
-    tracer = build_tracer(scene)
-    view = view_samples(scene, tracer)
-    on_floor = np.flatnonzero(view.points.instance == 0)
-    gather = gather_samples(scene, tracer, view, n=20)
-    builder = RowBuilder(scene, tracer, gather, 0)
-    points = take_points(view.points, on_floor)
-    found = builder.measure(points, np.arange(len(on_floor) + 1), on_floor, 4096, 0, sky=SKY)
-    # Diffuse light through one interface into glass: 1 - 0.0918 (Egan & Hilgeman 1973 for n = 1.5).
-    assert found.sky.row_sums().mean() == pytest.approx(1 - 0.0918, abs=0.004)
 
 
 def test_the_table_finds_the_cells_of_the_walk() -> None:
@@ -293,7 +275,7 @@ def test_placements_with_too_many_triangles_go_without_a_table(monkeypatch: pyte
     assert len(bare.hit_cells.table(scene.geometry, 1 << 40).face) == len(table.face)
     stream = np.arange(view.n)
     builder = RowBuilder(scene, tracer, bare, 3)
-    assert_all_same(whole, builder.measure(view.points, np.arange(view.n + 1), stream, 50, 0, sky=SKY))
+    assert_all_same(whole, builder.measure(view.points, np.arange(view.n + 1), stream, 50, 0))
 
 
 def test_few_look_ups_go_without_a_map_and_find_the_same() -> None:
@@ -301,7 +283,7 @@ def test_few_look_ups_go_without_a_map_and_find_the_same() -> None:
     mapped = measure(n_rays=50)
     fresh = replace(gather)
     stream, begin = np.arange(view.n), np.arange(view.n + 1)
-    walked = RowBuilder(scene, tracer, fresh, 3).measure(view.points, begin, stream, 50, 0, sky=SKY)
+    walked = RowBuilder(scene, tracer, fresh, 3).measure(view.points, begin, stream, 50, 0)
     assert_all_same(mapped, walked)
     triangles = np.diff(scene.geometry.mesh_begin)[scene.geometry.instance_mesh].sum()
     look_ups = HitCells(gather.locator)
