@@ -176,6 +176,8 @@ def _piece_deltas(  # type: ignore[no-untyped-def]
     restrict = version_restrict[version, 0]
     unedited = version_restrict[version, 1]
     reach = version_restrict[version, 2]
+    # Offsets are sums over all cells, those too that none of the rows acts on.
+    all_cells = row_changed[0] != 0 or version_restrict[version, 3] != 0
     n_groups = len(b)
     found = np.empty((n_groups, 4, 3))
     total_found = np.zeros((n_groups, 4, 3))
@@ -189,7 +191,7 @@ def _piece_deltas(  # type: ignore[no-untyped-def]
     for k in range(piece[1], piece[2]):
         cell = cells[k]
         first, end = cell_begin[cell], cell_begin[cell + 1]
-        if row_changed[0] == 0 and not _concerned(row_changed, entry_row, first, end):
+        if not all_cells and not _concerned(row_changed, entry_row, first, end):
             continue
         share = 1.0
         if restrict >= 0:
@@ -301,12 +303,13 @@ def version_deltas(  # type: ignore[no-untyped-def]
     ----------
     pieces : (n, 3) int64, version and range of `cells`
     row_changed : (1 + n_rows,) uint8
-        Cells that none of the marked rows acts on keep what they have; all are evaluated if the first is set.
+        Cells that none of the marked rows acts on keep what they have; all are evaluated if the first is set, or
+        the version has offsets.
     version_sets : (n_versions + 1,) ranges of `set_sign` and `sets`
     sets : (n_sets, n_members) uint8, rows of the stack that act
-    version_restrict : (n_versions, 3) int64
+    version_restrict : (n_versions, 4) int64
         Row whose casters and lights alone count, or -1; 1 to subtract the unedited light; 1 for the casters'
-        weights instead of light.
+        weights instead of light; 1 if some row may give an offset.
     run_of, looks : (n_gather,)
         Cells of one number that follow each other are acted on alike, unless an edit looks at their light.
     cells, deltas : (n_cells,), (n_cells, 3)

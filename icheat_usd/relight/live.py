@@ -124,7 +124,7 @@ class LiveRelighter:
         self._command(lambda: self._stack.set_stack(stack, self._light_paths()))
 
     def set_amount(self, edit_path: str, amount: float) -> None:
-        """Change how much of one edit is laid over the others; 0 leaves it out.
+        """Change how much of one edit is laid over the others; 0 leaves it out, as `mute` does.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class LiveRelighter:
         self._command(lambda: self._stack.set_edit(replace(edit, keys=keys)))
 
     def mute(self, edit_path: str, muted: bool = True) -> None:
-        """Leave one edit out, or show it again."""
+        """Leave one edit out, or show it again; what shares its samples is found anew, as for a new edit."""
         edit = replace(self._stack.edit(edit_path), enabled=not muted)
         self._command(lambda: self._stack.set_edit(edit))
 
@@ -291,8 +291,6 @@ class LiveRelighter:
             self._changed_samples.append(change.samples)
             self._samples_of.clear()
             self._place(change.samples)
-        elif (self._stack.active_rows != self._active_rows).any():
-            self._find_touched()
 
     def _regroup(self, divided: bool = False) -> None:
         """Find anew which samples share what; `divided` as in `relight.groups.group_terms`."""
@@ -355,9 +353,8 @@ class LiveRelighter:
         self._find_touched()
 
     def _find_touched(self) -> None:
-        """Which samples the edits that are not muted touch; the others keep their unedited light, bit for bit."""
-        self._active_rows = self._stack.active_rows
-        self._touched = self._touched_by(np.flatnonzero(self._active_rows))
+        """Which samples edits touch; the others keep their unedited light, bit for bit."""
+        self._touched = self._touched_by(range(len(self._stack.receiver_masks)))
         self._mixed_samples = np.flatnonzero(self._mixed)
         touched = self._touched if self._touched.any() else self._touched[:0]
         self._own_light = OwnLight(self._mixed_samples.astype(np.int32), self._own, touched)

@@ -17,7 +17,7 @@ from icheat_usd.errors import EditError
 from icheat_usd.relight.compiled import CompiledStack, Way, compile_stack, numbers_of
 from icheat_usd.relight.painted import PaintedPoints
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, F64, I64, Bool, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
 
 #: Sides of an edit: fields of a payload.
 RECEIVERS, CASTERS = "receiver_mask", "caster_mask"
@@ -45,8 +45,9 @@ class _Exchange(NamedTuple):
 class LiveStack:
     """What a `LiveRelighter` knows about its stack.
 
-    Edits that are muted keep their place with an amount of 0, so that turning
-    them on and off changes numbers and no structure.
+    Edits that are muted or have an amount of 0 are no part of what is bound, so
+    that the light is bit for bit the same as without them; muting one changes
+    the structure.
     """
 
     def __init__(self, snapshot: SceneSnapshot, view: ViewSamples, gather: GatherSamples, at_records: bool) -> None:
@@ -61,12 +62,6 @@ class LiveStack:
     receiver_masks: F32  #: (n_rows, n_view)
     caster_masks: F32  #: (n_rows, n_gather)
     light_paths: tuple[str, ...]
-
-    @property
-    def active_rows(self) -> Bool:
-        """(n_rows,) which rows belong to edits that are not muted."""
-        active = np.array([bound.edit.amount != 0 for bound in self.field.edits], np.bool_)
-        return active[self.compiled.row_table[:, 0]]
 
     def set_stack(self, stack: EditStack, light_paths: tuple[str, ...]) -> Change | None:
         """Take another stack; what changed, or None if the structure is another one."""
@@ -114,18 +109,7 @@ class LiveStack:
     # Binding ----------------------------------------------------------------------------------------------------------
 
     def _bind(self, stack: EditStack, light_paths: tuple[str, ...]) -> EditField:
-        snapshot = replace(self._snapshot, light_paths=light_paths)
-        shown = tuple(_shown(edit) for edit in stack.edits)
-        try:
-            field = bind(EditStack(stack.path, shown), snapshot)
-        except EditError:
-            # A muted edit may be one that cannot be shown: that is what muting it is for.
-            shown = tuple(
-                _shown(edit) for edit in stack.edits if _is_active(stack, edit) or _can_be_bound(edit, snapshot)
-            )
-            field = bind(EditStack(stack.path, shown), snapshot)
-        now = {edit.path: _weighed(stack, edit) for edit in stack.edits}
-        return replace(field, edits=tuple(replace(bound, edit=now[bound.edit.path]) for bound in field.edits))
+        return bind(stack, replace(self._snapshot, light_paths=light_paths))
 
     def _show(self, stack: EditStack, field: EditField, light_paths: tuple[str, ...]) -> None:
         receivers = field.receivers(self._view.points).masks
@@ -143,16 +127,14 @@ class LiveStack:
         place = {bound.edit.path: k for k, bound in enumerate(self.field.edits)}
         changed = []
         for before, now in zip(self.stack.edits, stack.edits, strict=True):
-            if before is now and stack.enabled == self.stack.enabled:
+            was_active, is_active = self.stack.enabled and before.is_active, stack.enabled and now.is_active
+            if before is now and was_active == is_active or not (was_active or is_active):
                 continue
-            if not _same_structure(before, now):
+            if was_active != is_active or not _same_structure(before, now) or now.path not in place:
                 return None
-            if now.path in place:
-                if any(selection.findings for selection in _selections(self.field.edits[place[now.path]])):
-                    return None
-                changed.append((place[now.path], _weighed(stack, now)))
-            elif _is_active(stack, now) or before.keys != now.keys:
+            if any(selection.findings for selection in _selections(self.field.edits[place[now.path]])):
                 return None
+            changed.append((place[now.path], now))
         return changed
 
     def _exchange(self, changed: list[tuple[int, Edit]]) -> Change | None:
@@ -225,27 +207,6 @@ class LiveStack:
 
     def _rows(self, edit: int) -> range:
         return self.compiled.rows_of(edit)
-
-
-def _is_active(stack: EditStack, edit: Edit) -> bool:
-    return stack.enabled and edit.is_active
-
-
-def _shown(edit: Edit) -> Edit:
-    return edit if edit.is_active else replace(edit, enabled=True, amount=1.0)
-
-
-def _weighed(stack: EditStack, edit: Edit) -> Edit:
-    """The edit with what it counts now: a muted one is not multiplied by anything but 0."""
-    return edit if _is_active(stack, edit) else replace(edit, amount=0.0)
-
-
-def _can_be_bound(edit: Edit, snapshot: SceneSnapshot) -> bool:
-    try:
-        bind(EditStack("", (_shown(edit),)), snapshot)
-    except EditError:
-        return False
-    return True
 
 
 def _same_structure(a: Edit, b: Edit) -> bool:

@@ -39,7 +39,7 @@ class VersionTables(NamedTuple):
     set_begin: I64
     sets: U8
     sign: F64
-    restrict: I64  #: (n_versions, 3) see `kernels.versions.version_deltas`
+    restrict: I64  #: (n_versions, 4) see `kernels.versions.version_deltas`
 
 
 class _Rows:

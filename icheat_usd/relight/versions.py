@@ -276,6 +276,11 @@ class Versions:
         nodes, child = self._products.nodes(cells if not by_pairs else cells[:0])
         return _Version(key, cells, nodes, child, sets, sign, rows, by_pairs)
 
+    def _restrict(self, version: _Version) -> tuple[int, bool, bool, bool]:
+        key = version.key
+        unedited = not key.differ and key.restrict < 0
+        return key.restrict, unedited, key.reach, bool(self._compiled.gives_offset[list(version.rows)].any())
+
     def _arrange(self) -> None:
         if self._tables is not None:
             return
@@ -291,9 +296,7 @@ class Versions:
             _begins([len(v.sign) for v in versions]),
             np.concatenate([np.empty((0, len(self._compiled.edit_of)), np.uint8), *(v.sets for v in versions)]),
             np.concatenate([np.empty(0), *(v.sign for v in versions)]),
-            np.array(
-                [[v.key.restrict, not v.key.differ and v.key.restrict < 0, v.key.reach] for v in versions], np.int64
-            ).reshape(-1, 3),
+            np.array([self._restrict(version) for version in versions], np.int64).reshape(-1, 4),
         )
         deltas = np.zeros((len(self._tables.cells), 3), np.float32)
         deltas[:known_cells] = self._deltas

@@ -108,30 +108,24 @@ def repainted(mask: SurfaceMask, rng: np.random.Generator) -> SurfaceMask:
     return replace(mask, texels=texels)
 
 
-@pytest.mark.parametrize(
-    "operations", [("scale", "hsv", "scale"), ("gamma", "paint", "falloff"), ("emit", "curve", "receive")]
-)
-def test_the_same_state_has_the_same_bits_whatever_led_to_it(operations):
-    of = pipeline("full")
-    edits = tuple(soft(f"e{k}", name, "/floor", "/red", 3 * k) for k, name in enumerate(operations))
-    stack = EditStack("/stack", (*edits, edit("hard", "scale", amount=0.5)))
-    shown = fresh(of, stack, np.ones((2, 3), np.float32))
-    shown.commit()
-    rng = np.random.default_rng(len(operations[0]))
-    for step in range(24):
-        path = f"/e{rng.integers(3)}"
-        command = rng.choice(["amount", "mute", "reorder", "dab", "undo", "redo", "gain", "commit", "frame"])
+def act_at_random(shown: LiveRelighter, rng: np.random.Generator, n_steps: int) -> None:
+    """Commands on a stack of four edits, and frames and refinements between them."""
+    paths = [edit.path for edit in shown.stack.edits]
+    commands = ["amount", "mute", "reorder", "dab", "undo", "redo", "gain", "commit", "refine"]
+    for step in range(n_steps):
+        path, command = str(rng.choice(paths)), rng.choice(commands)
         if command == "amount":
-            shown.set_amount(path, float(rng.choice([0.0, 0.3, 1.2])))
+            shown.set_amount(path, float(rng.choice([0.0, 0.3, 0.6, 1.2])))
         elif command == "mute":
             shown.mute(path, bool(rng.integers(2)))
         elif command == "reorder":
             shown.reorder([shown.stack.edits[k].path for k in rng.permutation(4)])
         elif command == "dab":
-            side = str(rng.choice(["receivers", "casters"]))
-            payload = next(e for e in shown.stack.edits if e.path == path).keys[1].payload
+            painted = [edit for edit in shown.stack.edits if edit.keys]
+            side, chosen = str(rng.choice(["receivers", "casters"])), painted[rng.integers(len(painted))]
+            payload = chosen.keys[1].payload
             mask = payload.receiver_mask if side == "receivers" else payload.caster_mask
-            shown.dab(path, side, repainted(mask, rng), key=1)
+            shown.dab(chosen.path, side, repainted(mask, rng), key=1)
         elif command in ("undo", "redo"):
             with contextlib.suppress(EditError):
                 getattr(shown, command)()
@@ -139,12 +133,64 @@ def test_the_same_state_has_the_same_bits_whatever_led_to_it(operations):
             shown.lights.set_gain(int(rng.integers(2)), rng.uniform(0, 2, 3))
         elif command == "commit":
             shown.commit()
+        elif command == "refine":
+            shown.refine()
         if step % 3 == 0:
             shown.frame()
+
+
+def painted_stack(*operations: str) -> EditStack:
+    edits = tuple(soft(f"e{k}", name, "/floor", "/red", 3 * k) for k, name in enumerate(operations))
+    return EditStack("/stack", (*edits, edit("hard", "scale", amount=0.5)))
+
+
+def overlapping_stack() -> EditStack:
+    """Edits of different casters that overlap partly; some add light that no transport brings."""
+    floor = select("/floor")
+    return EditStack(
+        "/stack",
+        (
+            edit("paint", "paint", floor, select("/red", "/back", "/green")),
+            edit("dark", "scale", floor, select("/red")),
+            soft("soft_paint", "paint", "/floor", "/back", 3),
+            soft("soft_scale", "scale", "/floor", "/back", 5),
+        ),
+    )
+
+
+STACKS = {
+    "scale and hsv": painted_stack("scale", "hsv", "scale"),
+    "pairs": painted_stack("gamma", "paint", "falloff"),
+    "curve and receive": painted_stack("emit", "curve", "receive"),
+    "overlapping casters": overlapping_stack(),
+}
+
+
+@pytest.mark.parametrize("stack", STACKS)
+def test_the_same_state_has_the_same_bits_whatever_led_to_it(stack):
+    of = pipeline("full")
+    shown = fresh(of, STACKS[stack], np.ones((2, 3), np.float32))
+    shown.commit()
+    act_at_random(shown, np.random.default_rng(len(stack)), 24)
     again = fresh(of, shown.stack, shown.lights.gains)
     np.testing.assert_array_equal(shown.frame(), again.frame())
     for found, expected in zip(shown.relit(), again.relit(), strict=True):
         np.testing.assert_array_equal(found, expected)
+
+
+def test_offsets_of_all_casters_stay_when_the_edit_of_some_changes():
+    """Each amount changed alone: a paint adds light for all of its casters, whatever the others act on."""
+    stack, gains = overlapping_stack(), np.ones((2, 3), np.float32)
+    of = pipeline("full")
+    shown = fresh(of, stack, gains)
+    before = shown.frame()
+    for one in stack.edits:
+        shown.set_amount(one.path, 0.4)
+        found = shown.frame()
+        assert np.abs(found - before).max() > 0.001
+        np.testing.assert_array_equal(found, fresh(of, shown.stack, gains).frame())
+        shown.set_amount(one.path, one.amount)
+        np.testing.assert_array_equal(shown.frame(), before)
 
 
 def test_baked_rows_equal_the_exact_relighter():
@@ -173,6 +219,38 @@ def test_wavelets_that_lose_nothing_change_nothing(operation):
     np.testing.assert_allclose(shown.relit().indirect_edited, expected.indirect_edited, rtol=1e-4, atol=2e-6)
     shown.set_transport(of.transport)
     np.testing.assert_array_equal(shown.frame(), fresh(of, EditStack("/stack", edits), np.ones((2, 3))).frame())
+
+
+OFF = {
+    "hard": edit("off", "scale", select("/floor", "/back"), select("/green", "/ceiling")),
+    "soft": soft("off", "scale", "/floor", "/ceiling", 3),
+    "looks at receivers": edit("off", "falloff", select("/floor"), select("/red")),
+    "adds light": edit("off", "paint", select("/floor"), select("/red")),
+    "of one light": edit("off", "scale", lights=("/warm",)),
+}
+
+
+@pytest.mark.parametrize("is_packed", [False, True], ids=["exact", "packed"])
+@pytest.mark.parametrize("kind", OFF)
+def test_an_edit_that_is_off_is_skipped_bit_for_bit(kind, is_packed, monkeypatch):
+    """Muted, at an amount of 0, and turned off while it is shown."""
+    # Between the casters of the first edit and those of both: these are transformed in two ways.
+    monkeypatch.setattr("icheat_usd.relight.products._MANY_CELLS", 15)
+    of, gains = pipeline("full"), np.array([[0.3, 1.7, 0.9], [1.1, 0.7, 0.6]], np.float32)
+    on, off = edit("on", "scale", select("/floor", "/back", "/tall"), select("/red")), OFF[kind]
+    rows = packed("full") if is_packed else of.transport
+
+    def image(*edits: Edit) -> F32:
+        return fresh_packed(of, rows, EditStack("/stack", edits), gains).frame()
+
+    expected = image(on)
+    assert np.abs(image(on, off) - expected).max() > 0.001
+    np.testing.assert_array_equal(image(on, replace(off, enabled=False)), expected)
+    np.testing.assert_array_equal(image(on, replace(off, amount=0.0)), expected)
+    shown = fresh_packed(of, rows, EditStack("/stack", (on, off)), gains)
+    shown.frame()
+    shown.mute(off.path)
+    np.testing.assert_array_equal(shown.frame(), expected)
 
 
 def test_many_versions_are_divided(monkeypatch):
