@@ -146,7 +146,19 @@ def nearest_listed(candidates, sample, entry, detour, x, y, z, nx, ny, nz):  # t
 def divide_faces(points, to_world, locator, spacing, fineness, placed_instance, place, out):  # type: ignore[no-untyped-def]
     """Squares along both edges of every side of the placed triangles, (2 n, 2); 0 where a side has one sample.
 
-    `spacing` (n_slots,) is the mean distance of samples, `fineness` the size of a square in these.
+    Parameters
+    ----------
+    points : (n_triangles, 3, 3) float32, object space
+    to_world : (n_instances, 3, 4) float32
+    spacing : (n_slots,)
+        Mean distance of samples, metres.
+    fineness : float
+        Size of a square in these.
+    placed_instance : (n_placed,)
+        Instance of each placed triangle.
+    place : (n_instances,) int64, see `CellTable`
+    out : (2 n_placed, 2) int32
+        Row 2 p + side.
     """
     for p in prange(len(placed_instance)):
         i = placed_instance[p]
@@ -267,7 +279,9 @@ def find_candidates(  # type: ignore[no-untyped-def]
 ):
     """Candidates of the squares of some blocks: `count` (n, 16), -1 for too many, and `found` (n, 16, MOST).
 
-    Block ``block_number[b]``, row by row, of side ``block_face[b]``.
+    Block ``block_number[b]``, row by row, of side ``block_face[b]``, both (n,) integers. `points` to `place` as for
+    `divide_faces`, with `to_object` (n_instances, 3, 4) float32, the locator's `depth`, and `divided` its result;
+    `count` and `found` are int32.
     """
     record, sample = locator.record, locator.sample
     slots, slot_begin, slot_record, slot_detour = (

@@ -15,7 +15,7 @@ _BLOCK = 256
 
 @parallel_kernel
 def find_bins(directions: np.ndarray, out: np.ndarray) -> None:
-    """Bin of each unit direction, world space."""
+    """Bin of each unit direction (n, 3) float32, world space, to `out` (n,) uint16."""
     for block in prange((len(directions) + _BLOCK - 1) // _BLOCK):
         for i in range(block * _BLOCK, min(len(directions), (block + 1) * _BLOCK)):
             x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
@@ -35,7 +35,20 @@ def shine(
     gloss_tint: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Light of the `sky` (n_bins, 3) that each place reflects by its two lobes; `glossy` may be empty."""
+    """Light of the sky that each place reflects by its two lobes.
+
+    Parameters
+    ----------
+    begin : (n + 1,) int64
+        Entries ``begin[i]:begin[i + 1]`` are of place i.
+    bins : (n_entries,) uint16
+    diffuse : (n_entries,) float32, irradiance per radiance
+    glossy : (n_entries,) float32, reflected radiance per radiance; or empty
+    sky : (n_bins, 3) float32, radiance
+    tint, gloss_tint : (n, 3) float32
+        Albedo over pi; colour of the specular lobe.
+    out : (n, 3) float32, reflected radiance
+    """
     has_gloss = len(glossy) > 0
     for block in prange((len(out) + _BLOCK - 1) // _BLOCK):
         for i in range(block * _BLOCK, min(len(out), (block + 1) * _BLOCK)):

@@ -364,7 +364,12 @@ def count_hits(  # type: ignore[no-untyped-def]
 def rays_of_rows(  # type: ignore[no-untyped-def]
     position, shading_normal, normal, point_begin, stream, seed, of_rays, row, ray, origins, directions, counter
 ):
-    """Ray ``ray[q]`` of row ``row[q]`` (q,), and a number of its own for random choices on its way."""
+    """Ray ``ray[q]`` of row ``row[q]``, and a number of its own for random choices on its way.
+
+    Inputs as for `count_hits`; `row` and `ray` are (n,) integers. Out: `origins`
+    and `directions` (n, 3) float32, 0 where a direction is below the surface,
+    and `counter` (n,) int32.
+    """
     for q in prange(len(row)):
         r, k = np.int64(row[q]), np.int64(ray[q])
         row_seed = hash_combine(seed, stream[r])

@@ -14,7 +14,10 @@ LANES = 64  # rows of a block of a dense matrix
 
 @parallel_kernel
 def shorten(indices: np.ndarray, weights: np.ndarray, column_bits: int, out: np.ndarray) -> None:
-    """Entries in one word each: weights rounded to the leading bits of a float32, columns in the others."""
+    """Entries in one word each: weights rounded to the leading bits of a float32, columns in the others.
+
+    `indices` (n,) int32 below ``2 ** column_bits``, `weights` (n,) float32, `out` (n,) uint32.
+    """
     words = weights.view(np.uint32)
     half = np.int64(1) << (column_bits - 1)
     for chunk in prange((len(indices) + 65535) // 65536):
@@ -35,9 +38,15 @@ def find_residual(
     albedo: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """``out = direct - light + albedo * (rows @ light)``; `entries` are those of `shorten`.
+    """``out = direct - light + albedo * (rows @ light)``.
 
-    `light` and `out` have a fourth column, 0 in `light`.
+    Parameters
+    ----------
+    indptr : (n_gather + 1,) int64
+    entries : (n_entries,) uint32, of `shorten`
+    direct, albedo : (n_gather, 3) float32
+    light, out : (n_gather, 4) float32, 16-byte rows
+        The fourth column is 0 in `light`, and means nothing in `out`.
     """
     mask = np.uint32((1 << column_bits) - 1)
     weights = entries.view(np.float32)
@@ -64,7 +73,11 @@ def find_residual(
 
 @parallel_kernel
 def cluster_means(begin: np.ndarray, weight: np.ndarray, light: np.ndarray, out: np.ndarray) -> None:
-    """Weighted mean over each cluster, (3, n_clusters); weights of a cluster sum to 1."""
+    """Weighted mean over each cluster, whose cells follow one another.
+
+    `begin` (n_clusters + 1,) int64; `weight` (n_gather,) float32, summing to 1 in a cluster;
+    `light` (n_gather, 3 or more) and `out` (3, n_clusters) float32.
+    """
     for c in prange(len(begin) - 1):
         r = np.float32(0.0)
         g = np.float32(0.0)
@@ -82,7 +95,11 @@ def cluster_means(begin: np.ndarray, weight: np.ndarray, light: np.ndarray, out:
 def add_clusters(
     begin: np.ndarray, albedo: np.ndarray, light: np.ndarray, arriving: np.ndarray, out: np.ndarray
 ) -> None:
-    """Add to `out` the `light` of each cell, and what it reflects of the light that arrives at its cluster."""
+    """Add to `out` the `light` of each cell, and what it reflects of the light that arrives at its cluster.
+
+    `begin` (n_clusters + 1,) int64; `albedo` (n_gather, 3), `light` and `out` (n_gather, 4), and
+    `arriving` (n_clusters, 3) float32.
+    """
     for c in prange(len(begin) - 1):
         for i in range(begin[c], begin[c + 1]):
             for k in range(3):
@@ -91,7 +108,10 @@ def add_clusters(
 
 @parallel_kernel
 def reach_clusters(blocks: np.ndarray, leaves: np.ndarray, out: np.ndarray) -> None:
-    """Products of dense matrices, one per colour: `blocks` (n_blocks, 3, n, LANES) hold LANES rows each, transposed."""
+    """Products of dense matrices, one per colour.
+
+    `blocks` (n_blocks, 3, n, LANES) float32 hold LANES rows each, transposed; `leaves` (3, n) and `out` (n, 3) float32.
+    """
     n = leaves.shape[1]
     for task in prange(len(blocks) * 3):
         block, channel = task // 3, task % 3
@@ -109,7 +129,12 @@ def merge_rows(
     begin: np.ndarray, weight: np.ndarray, cluster: np.ndarray, indptr: np.ndarray, indices: np.ndarray,
     weights: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add to `out` (n_clusters, n_clusters) weighted means of the rows of each cluster, columns summed by cluster."""
+    """Add to `out` weighted means of the rows of each cluster, columns summed by cluster.
+
+    `begin` (n_clusters + 1,) int64; `weight` (n_gather,) float32 and `cluster` (n_gather,) int32 of each cell;
+    `indptr` (n_gather + 1,) int64, `indices` int32 and `weights` float32 of the rows; `out` (n_clusters, n_clusters)
+    float32.
+    """
     for c in prange(len(begin) - 1):
         for i in range(begin[c], begin[c + 1]):
             for e in range(indptr[i], indptr[i + 1]):

@@ -300,14 +300,31 @@ def record_weights(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
+    samples : (n_samples,)
+        Rows of the arrays of n_view samples.
+    pixel, instance : (n_view,) integers
+    position, normal : (n_view, 3) float32
+        World space, metres; unit shading normals.
+    extent : (n_view,) float32
+        Width of a pixel at the sample, metres.
+    corners : (n_view,) float32, of `corner_distance`
+    nearness : (n_view,) float32
+        1 / depth, 1 / metres; 1 for parallel rays.
+    level : (height, width) int32, corner : (height, width) uint8
+        Level of each pixel's block; not 0 at the blocks' corners.
     record_at : (height, width)
         Record of the first view sample of each pixel, or -1.
     record_of : (n_view,)
         Record of each view sample, or -1.
     record_view : (n_records,)
         View sample of each record.
+    bucket_side : int, pixels
+    bucket_begin : (n_buckets + 1,), bucket_record : (n_records,)
+        Records by bucket, row by row.
     strict
         0 accepts records of any sheet.
+    count : (n_samples,) int64, out_record : (n_samples, MAX_ENTRIES) int32, out_weight : the same, float32
+        Out.
     fit : (n_samples,)
         Share that the block's corners took.
     reach : (n_samples,)

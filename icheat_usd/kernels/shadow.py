@@ -170,8 +170,8 @@ def light_places(
     arguments : address of RTCOccludedArguments, or 0
     table : (m, 12) float32
         Points of the light: place, normal, colour, radiance times the whole light's area. Distant lights:
-        directions, and radiance times solid angle. m is a power of two and a multiple of
-        `CANDIDATES`.
+        directions, and radiance times solid angle; those without an angle: irradiance on a plane that faces
+        them. m is a power of two and a multiple of `CANDIDATES`.
     turn : int
         Number of the ray of each place: in m / `CANDIDATES` turns a place looks at every point once.
     place : (n, 9) float32

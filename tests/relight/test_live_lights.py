@@ -96,6 +96,18 @@ def test_a_light_that_was_moved_about_ends_like_one_that_always_stood_there(scen
     np.testing.assert_array_equal(moved_there.view_direct, there.view_direct)
 
 
+def test_a_dome_that_was_turned_about_ends_like_one_that_always_stood_so(scene: Pipeline) -> None:
+    turned = rotation((0, 1, 0), 70)[:3].astype(np.float32)
+    lights = settle(build(scene))
+    lights.change(2, to_world=rotation((0, 1, 0), 200)[:3])
+    lights.refine()
+    lights.change(2, to_world=turned)
+    settle(lights)
+    there = settle(build(scene, room(RECT, SPHERE, replace(DOME, to_world=turned))))
+    np.testing.assert_array_equal(lights.radiance[2], there.radiance[2])
+    np.testing.assert_array_equal(lights.view_direct[2], there.view_direct[2])
+
+
 def test_one_light_s_change_leaves_the_others_alone(scene: Pipeline) -> None:
     lights = build(scene)
     radiance, direct = lights.radiance.copy(), lights.view_direct.copy()
