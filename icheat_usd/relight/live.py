@@ -104,7 +104,7 @@ class LiveRelighter:
         self._products = Products(transport, self.gather.tree)
         self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
         self._exact_products: Products | None = None
-        self._is_exact = False
+        self._n_exact = 0  # tiles of exact rows that the unedited light has
         self._narrow: Narrow | None = None
         if exact is not None and exact is not transport:
             self._exact_products = Products(exact, self.gather.tree, self._products.names)
@@ -264,10 +264,10 @@ class LiveRelighter:
                 return True
             if self._versions.refine(self._exact_products):
                 return True
-            if not self._is_exact:
-                self._shared.set_unedited(self._light(), self._exact_products)
+            if self._n_exact < self._exact_products.n_tiles:
+                self._n_exact = self._shared.refine_unedited(self._light(), self._exact_products, self._n_exact)
                 self._base_stale = True
-                self._is_exact = True
+                return True
             self._show(self._mixed_samples)
         return False
 
@@ -390,7 +390,7 @@ class LiveRelighter:
                 self._shared.set_unedited_at_rest(self._light(), self._narrow, self.lights.gains)
             else:
                 self._shared.set_unedited(self._light())
-            self._is_exact = False
+            self._n_exact = 0
             self._base_stale = True
             self._versions.light_changed(self._by_group)
             samples = self._mixed_samples

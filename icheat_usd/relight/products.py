@@ -22,6 +22,8 @@ from icheat_usd.transport.packed import LANES, LargeTerms, PackedRows, PackedTra
 _MANY_CELLS = 4096
 #: Quanta that are read of a large transport for light not seen before: a quarter of them loses little beside packing.
 MOVING_BYTES = 80_000_000
+#: Entries of uncompressed rows that are multiplied in one step of a refinement: some hundredths of a second.
+_ENTRIES_AT_ONCE = 5_000_000
 #: Versions that are transformed at once.
 _TOGETHER = 8
 
@@ -193,6 +195,31 @@ class Products:
         leaves[0, cells, :3] = values
         for lobe in range(len(self._rows)):
             self._multiply(lobe, leaves, tile, np.zeros_like(tile), out[lobe], False, _NONE, _NONE[0])
+
+    def multiply_more(self, b: F32, first: int, out: F32) -> int:
+        """Products of some tiles of uncompressed rows, from `first` on, with leaf values (n_leaves, 3).
+
+        Parameters
+        ----------
+        out : (n_lobes, at least n_tiles, 64, 4) float32
+            Receives those of these tiles.
+
+        Returns
+        -------
+        int
+            The first tile that is left; `n_tiles` after the last.
+        """
+        assert not self._haar
+        begin = np.arange(self.n_tiles + 1) * LANES
+        entries = sum((rows.rows.indptr[np.minimum(begin, rows.rows.n_rows)] for rows in self._rows), 0 * begin)
+        end = int(np.searchsorted(entries, entries[first] + _ENTRIES_AT_ONCE, side="right")) - 1
+        end = min(max(end, first + 1), self.n_tiles)
+        values = np.zeros((1, self._n_leaves, 4), np.float32)
+        values[0, :, :3] = b
+        tile = np.arange(first, end, dtype=np.int32)
+        for lobe in range(len(self._rows)):
+            self._multiply(lobe, values, tile, np.zeros_like(tile), out[lobe, first:end], False, _NONE, _NONE[0])
+        return end
 
     def multiply_all(self, b: F32, out: F32, narrow: bool = False) -> None:
         """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``; `narrow`: as `multiply`.

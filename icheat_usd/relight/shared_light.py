@@ -109,9 +109,13 @@ class SharedLight:
         sums[:, : self._sums.shape[1]] = self._sums
         self._sums = sums
 
-    def set_unedited(self, b: F32, products: Products | None = None) -> None:
-        """Multiply the transport, or the `products` of exact rows, with the unedited light (n_gather, 3)."""
-        (products or self._products).multiply_all(b, self._sums)
+    def set_unedited(self, b: F32) -> None:
+        """Multiply the transport with the unedited light (n_gather, 3)."""
+        self._products.multiply_all(b, self._sums)
+
+    def refine_unedited(self, b: F32, exact: Products, first: int) -> int:
+        """Multiply some tiles of exact rows with the unedited light, from `first` on; the first tile that is left."""
+        return exact.multiply_more(b, first, self._sums)
 
     def set_unedited_at_rest(self, b: F32, narrow: Narrow, gains: F32) -> None:
         """The same with the narrowed transport, of lights at rest under gains."""

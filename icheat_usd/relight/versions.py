@@ -16,8 +16,8 @@ from icheat_usd.relight.products import Products, VersionTables
 from icheat_usd.scene import F32, F64, I32, I64, U8
 from icheat_usd.transport.packed import LANES
 
-#: Pairs of tile and version that are refined at once, about.
-_PAIRS_AT_ONCE = 500
+#: Pairs of tile and version that are refined at once.
+_PAIRS_AT_ONCE = 256
 #: Casters of a version that are evaluated in one piece.
 _PIECE = 2048
 
@@ -57,6 +57,9 @@ class Versions:
         self._deltas: F32 = np.zeros((0, 3), np.float32)
         self._stale: set[int] = set()
         self._refined: set[int] = set()
+        self._exact_of = -1  # version that is being refined
+        self._exact: F32 = products.room(0)  # its first exact products
+        self._n_exact = 0  # how many of them there are
         self._known: set[int] = set()  # whose residual is known
         self._reference: F32 = np.zeros((0, 3), np.float32)  # what the differences of these were then
         self._lost: F32 = products.room(0)  # (n_lobes, n_pairs, 64, 4) what narrowed rows lost of that
@@ -126,6 +129,7 @@ class Versions:
         self._pairs_of = [order[ends[v] : ends[v + 1]].astype(np.int64) for v in range(self.n)]
         self._stale |= {v for v in set(version.tolist()) if self._versions[v].by_pairs}
         self._refined -= set(version.tolist())
+        self._exact_of = -1
         self._known -= set(version.tolist())
         # Those whose version is evaluated anyway are multiplied then.
         fresh = np.arange(first, len(self._pair_tile))
@@ -180,6 +184,7 @@ class Versions:
             if self._versions[v].by_pairs:
                 self._multiply_by_pairs(int(v))
         self._refined -= self._stale
+        self._exact_of = -1
         self._stale = set()
         self._changed_rows[:] = 0
 
@@ -199,7 +204,7 @@ class Versions:
         add_version_residuals(pairs, self._pair_version, lost, factors, values)
 
     def refine(self, exact: Products) -> bool:
-        """Multiply some versions with exact rows that were multiplied with packed ones; False when none is left."""
+        """Multiply some pairs with exact rows that were multiplied with packed ones; False when none is left."""
         self.update()
         self._arrange()
         tables = self._tables
@@ -211,15 +216,21 @@ class Versions:
             known = v in self._refined and (v in self._known or not narrow)
             if version.by_pairs or known or not len(pairs):
                 continue
-            if n_done > _PAIRS_AT_ONCE:
+            if n_done == _PAIRS_AT_ONCE:
                 return True
-            n_done += len(pairs)
+            if self._exact_of != v:
+                self._exact_of, self._exact, self._n_exact = v, exact.room(len(pairs)), 0
             some = slice(tables.cell_begin[v], tables.cell_begin[v + 1])
-            out = exact.room(len(pairs))
-            exact.multiply_cells(tables.cells[some], self._deltas[some], self._pair_tile[pairs], out)
+            part = slice(self._n_exact, min(self._n_exact + _PAIRS_AT_ONCE - n_done, len(pairs)))
+            n_done += part.stop - part.start
+            tile = self._pair_tile[pairs[part]]
+            exact.multiply_cells(tables.cells[some], self._deltas[some], tile, self._exact[:, part])
+            self._n_exact = part.stop
+            if part.stop < len(pairs):
+                return True
             if narrow:
-                self._learn_residual(v, out)
-            self.values[:, pairs] = out
+                self._learn_residual(v, self._exact)
+            self.values[:, pairs] = self._exact
             self._refined.add(v)
         return False
 

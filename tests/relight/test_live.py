@@ -269,6 +269,26 @@ def test_many_versions_are_divided(monkeypatch):
     np.testing.assert_allclose(divided.frame(), whole.frame(), rtol=1e-5, atol=1e-6)
 
 
+class RestingLights(StillLights):
+    moves = 0
+
+
+def poor(of: PackedTransport) -> PackedTransport:
+    """Int8 rows in few coefficients."""
+    lobes = []
+    for lobe in of.lobes:
+        rows = lobe.rows
+        scale = np.maximum(np.abs(rows.value).max(axis=1), 1e-20).astype(np.float32) / 127
+        quanta = np.rint(rows.value / scale[:, None]).astype(np.int8)
+        size = np.sqrt(np.square(rows.value).sum(axis=1))
+        kept = size > np.quantile(size, 0.6)
+        begin = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)[rows.tile_begin]
+        columns = {"index": rows.index, "scale": scale, "worth": rows.worth, "value": quanta}
+        rows = replace(rows, tile_begin=begin, **{name: column[kept] for name, column in columns.items()})
+        lobes.append(replace(lobe, rows=rows))
+    return replace(of, lobes=tuple(lobes))
+
+
 def test_refining_takes_back_what_packing_loses():
     of = pipeline("full")
     good = packed("full")
@@ -288,26 +308,6 @@ def test_refining_takes_back_what_packing_loses():
     while shown.refine():
         pass
     np.testing.assert_array_equal(shown.frame(), refined)
-
-
-class RestingLights(StillLights):
-    moves = 0
-
-
-def poor(of: PackedTransport) -> PackedTransport:
-    """Int8 rows in few coefficients."""
-    lobes = []
-    for lobe in of.lobes:
-        rows = lobe.rows
-        scale = np.maximum(np.abs(rows.value).max(axis=1), 1e-20).astype(np.float32) / 127
-        quanta = np.rint(rows.value / scale[:, None]).astype(np.int8)
-        size = np.sqrt(np.square(rows.value).sum(axis=1))
-        kept = size > np.quantile(size, 0.6)
-        begin = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)[rows.tile_begin]
-        columns = {"index": rows.index, "scale": scale, "worth": rows.worth, "value": quanta}
-        rows = replace(rows, tile_begin=begin, **{name: column[kept] for name, column in columns.items()})
-        lobes.append(replace(lobe, rows=rows))
-    return replace(of, lobes=tuple(lobes))
 
 
 def test_lights_at_rest_lose_nothing_in_a_narrowed_transport(monkeypatch):
@@ -367,6 +367,38 @@ def test_a_large_transport_is_read_in_part_while_lights_move(monkeypatch):
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=2e-4 * expected.max())
     assert np.abs(found - whole.relit().indirect).max() > 0.01 * expected.max()
     np.testing.assert_array_equal(shown._versions.values, whole._versions.values)
+
+
+def refined(shown: LiveRelighter) -> F32:
+    while shown.refine():
+        pass
+    return shown.frame()
+
+
+@pytest.mark.parametrize("stack", STACKS)
+def test_packed_light_ends_in_the_same_bits_whatever_led_to_it(stack, monkeypatch):
+    """Also where commands come between the steps of a refinement, and whichever way the rows are packed."""
+    of = pipeline("coarse")
+    rows = poor(packed("coarse"))
+    monkeypatch.setattr("icheat_usd.relight.narrow.NARROW_BYTES", rows.n_bytes // 4)
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, RestingLights(of))
+    shown.set_stack(STACKS[stack])
+    shown.commit()
+    with monkeypatch.context() as patch:
+        patch.setattr("icheat_usd.relight.products._ENTRIES_AT_ONCE", 100)
+        patch.setattr("icheat_usd.relight.versions._PAIRS_AT_ONCE", 1)
+        rng = np.random.default_rng(len(stack))
+        for _ in range(8):
+            act_at_random(shown, rng, 3)
+            for _ in range(rng.integers(20)):
+                shown.refine()
+        found = refined(shown)
+    again = fresh_packed(of, rows, shown.stack, shown.lights.gains)
+    packed_frame = again.frame()
+    np.testing.assert_array_equal(found, refined(again))
+    assert np.abs(found - packed_frame).max() > 0.001
+    other = fresh_packed(of, packed("coarse"), shown.stack, shown.lights.gains)
+    np.testing.assert_array_equal(found, refined(other))
 
 
 def test_casters_painted_at_rest_have_all_rows(monkeypatch):
