@@ -39,10 +39,10 @@ PREVIEW = Quality()
 RECORDS = replace(PREVIEW, record_error=0.01)
 
 #: The same, packed so that a frame takes milliseconds.
-LIVE = replace(RECORDS, packing_error=0.015)
+LIVE = replace(RECORDS, packing_error=0.0225)
 
 #: For a close look at what lives on: half the errors.
-LIVE_FINE = replace(PREVIEW, record_error=0.005, record_rays=4096, packing_error=0.0075)
+LIVE_FINE = replace(LIVE, record_error=0.005, record_rays=4096, packing_error=0.01)
 FINAL = GatherSettings()
 
 

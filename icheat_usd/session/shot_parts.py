@@ -40,6 +40,12 @@ class Memory(Protocol):
     def get(self, kind: str, key: str, make: Callable[[], Part]) -> Part:
         """The part of this key, made if it is not there."""
 
+    def find(self, kind: str, key: str) -> Any | None:
+        """The part of this key, if it is there."""
+
+    def keep(self, kind: str, key: str, part: Part) -> Part:
+        """The part, or the one that was there first."""
+
 
 class ShotParts:
     """One camera at one time: samples, transport and light; `snapshot` is given or overridden.
@@ -132,19 +138,27 @@ class ShotParts:
             raise ValueError("this quality asks for exact rows; give it a packing_error")
 
         def make(_: Shelf | None) -> PackedTransport:
-            return pack(self.transport, self.gather, self.training, error, progress=self.progress)
+            packed = pack(self.transport, self.gather, self.training, error, progress=self.progress)
+            # The exact rows have a shelf of their own.
+            return replace(packed, source=None)
 
-        return self._kept("packed", ("transport", "training"), make)
+        def whole() -> PackedTransport:
+            packed = self._from_disk("packed", ("transport", "training"), make)
+            return replace(packed, source=self.transport)
+
+        return whole() if self._memory is None else self._memory.get("packed", self.keys.packed, whole)
 
     def transports(self) -> Iterator[Transport | PackedTransport]:
         """Better and better ones, each usable; the last is what the quality asks for."""
         is_packed = self.quality.packing_error is not None
-        if "transport" not in self.__dict__ and not self._is_on_disk("packed" if is_packed else "transport"):
+        if not self._is_there("transport"):
             last: Transport | None = None
             shelf = self._shelf("transport") if self._disk.is_on else None
             for last in self._measured(shelf):
                 yield last
             assert last is not None
+            if self._memory is not None:
+                last = self._memory.keep("transport", self.keys.transport, last)
             self.__dict__["transport"] = last
             if shelf is not None:
                 self._keep_whole(shelf, last)
@@ -267,7 +281,12 @@ class ShotParts:
     def _shelf(self, kind: str) -> Shelf:
         return self._disk.shelf(kind, getattr(self.keys, kind), self._about())
 
-    def _is_on_disk(self, kind: str) -> bool:
+    def _is_there(self, kind: str) -> bool:
+        """Whether a part need not be made."""
+        if kind in self.__dict__:
+            return True
+        if self._memory is not None and self._memory.find(kind, getattr(self.keys, kind)) is not None:
+            return True
         return self._disk.is_on and "whole" in self._shelf(kind).names()
 
     def _about(self) -> dict[str, Any]:
