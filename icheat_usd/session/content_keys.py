@@ -1,8 +1,8 @@
 """Names for what is computed, made of everything it depends on: equal keys, equal results.
 
 Frames, sessions and processes that would compute the same thing find it by its key. A key covers the arrays of the
-scene, the settings, and the source of every module that takes part, so that neither an edited stage nor a new version
-of this package can be served what was made by another.
+scene, the settings, the sources of this package and the versions of the libraries that take part, so that neither an
+edited stage nor another version can be served what was made by other code.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import functools
 import hashlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,11 @@ from icheat_usd.session.quality import Quality
 #: Raised when the meaning of a kept part changes without a change of the sources below.
 _FORMAT = 1
 
-#: Packages whose source decides what is computed.
-_PACKAGES = ("kernels", "materials", "tracing", "lighting", "samples", "transport")
+#: Packages that nothing in this one imports: their sources cannot take part in what is kept.
+_ABOVE = ("cli", "ui")
+
+#: Libraries that take part beside those in `compiler_facts`.
+_LIBRARIES = ("embreex", "usd-core")
 
 
 @dataclass(frozen=True)
@@ -111,13 +115,26 @@ def _images(snapshot: SceneSnapshot, rows: Iterable[int]) -> list[Any]:
 
 @functools.cache
 def code_digest() -> str:
-    """Digest of the sources that compute what is kept, and of what compiles them; about 5 ms, once."""
+    """Digest of everything but data that decides what is computed; about 10 ms, once."""
     root = Path(icheat_usd.__file__).parent
     found = hashlib.sha256(compiler_facts().encode())
-    for path in sorted([root / "scene.py", *(file for name in _PACKAGES for file in (root / name).glob("*.py"))]):
+    found.update("\n".join(f"{name} {_version(name)}" for name in _LIBRARIES).encode())
+    for path in code_files(root):
         source = path.read_bytes()
         found.update(f"{path.relative_to(root).as_posix()} {len(source)}\n".encode() + source)
     return found.hexdigest()[:32]
+
+
+def code_files(root: Path) -> tuple[Path, ...]:
+    """Sources below a folder of this package that may take part in what is kept: too many rather than one too few."""
+    return tuple(sorted(path for path in root.rglob("*.py") if path.relative_to(root).parts[0] not in _ABOVE))
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "none"
 
 
 def digest(*values: Any) -> str:

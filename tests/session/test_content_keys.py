@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import icheat_usd
 from icheat_usd.scene import LightKind, SceneSnapshot
-from icheat_usd.session.content_keys import ShotKeys, digest, shot_keys
+from icheat_usd.session import content_keys
+from icheat_usd.session.content_keys import ShotKeys, code_digest, code_files, digest, shot_keys
 from icheat_usd.session.quality import Quality
 from tests.scenes import Image, Light, Mesh, look_at, make_snapshot, quad, translation
 
@@ -100,3 +105,41 @@ def test_values_that_could_be_confused_have_digests_of_their_own() -> None:
     assert len(set(digests)) == len(digests)
     with pytest.raises(TypeError, match="object has no digest"):
         digest(object())
+
+
+def test_every_module_that_a_kept_part_depends_on_is_in_the_keys() -> None:
+    """Imports are followed from what makes parts, wherever in a source they stand."""
+    root = Path(icheat_usd.__file__).parent
+    pending, needed = ["icheat_usd.session.shot_parts", "icheat_usd.session.disk_cache"], set[Path]()
+    while pending:
+        path = root.joinpath(*pending.pop().split(".")[1:])
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        if path in needed or not path.exists():
+            continue
+        needed.add(path)
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("icheat_usd"):
+                pending += [str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)]
+            elif isinstance(node, ast.Import):
+                pending += [alias.name for alias in node.names if alias.name.startswith("icheat_usd")]
+            assert not (isinstance(node, ast.ImportFrom) and node.level), f"{path}: imports here name the whole module"
+    names = {path.relative_to(root).as_posix() for path in needed}
+    assert {"relight/relighter.py", "session/shot_parts.py", "session/parts.py", "transport/packing.py"} <= names
+    assert needed <= set(code_files(root))
+
+
+def test_other_sources_and_other_libraries_make_other_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = Path(icheat_usd.__file__).parent
+    copied = shutil.copytree(root, tmp_path / "icheat_usd", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(content_keys.icheat_usd, "__file__", str(copied / "__init__.py"))
+    found = [code_digest.__wrapped__()]
+    for name in ("relight/relighter.py", "session/shot_parts.py", "session/parts.py", "kernels/vector.py", "scene.py"):
+        with open(copied / name, "a") as file:
+            file.write("# changed\n")
+        found.append(code_digest.__wrapped__())
+    monkeypatch.setattr(content_keys, "version", lambda name: "4.9.9")
+    found.append(code_digest.__wrapped__())
+    assert len(set(found)) == len(found)
+    with open(copied / "cli" / "cache.py", "a") as file:
+        file.write("# changed\n")
+    assert code_digest.__wrapped__() == found[-1]
