@@ -32,7 +32,7 @@ def test_random_commands_leave_memory_flat_and_end_where_a_fresh_session_does(
         live.wait("rest")
         # More than the history holds, so that memory has reached what it will need.
         first = soak(live, start, seconds=20, most_commands=220, frames=(1.0, 2.0), seed=1)
-        assert first.is_equal, first.difference
+        assert first.is_equal, first.differences
         tracemalloc.start()
         try:
             before, _ = tracemalloc.get_traced_memory()
@@ -40,7 +40,7 @@ def test_random_commands_leave_memory_flat_and_end_where_a_fresh_session_does(
             after, _ = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()
-    assert second.is_equal, second.difference
+    assert second.is_equal, second.differences
     assert sum(first.commands.values()) == 220 and len(first.commands) >= 12
     # What is replaced in the history was allocated before tracing began: at most 100 steps of it, with their masks.
     assert after - before < 100 * 40_000

@@ -38,8 +38,9 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         "refused": dict(found.refused.most_common(20)),
         "memory": found.memory,
         "growth": found.growth,
+        "slowdown": found.slowdown,
         "same_bits_as_fresh": found.is_equal,
-        "difference": found.difference,
+        "differences": found.differences,
     }
 
 
@@ -51,12 +52,13 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
             found = one["result"]
             count, minutes = sum(found["commands"].values()), found["seconds"] / 60
             end = (
-                "the same bits as a fresh session"
+                f"the same bits as a fresh session in {len(found['differences'])} states"
                 if found["same_bits_as_fresh"]
-                else f"off by {found['difference']:.2g}"
+                else f"off by {max(found['differences']):.2g}"
             )
             lines.append(
                 f"{one['case']['name']}: {count:,} commands in {minutes:.0f} min;"
-                f" memory {100 * found['growth']:+.1f} % from the second quarter to the last; at the end {end}."
+                f" memory {100 * found['growth']:+.1f} % from the second quarter to the last; at the end"
+                f" {end}."
             )
     return lines
