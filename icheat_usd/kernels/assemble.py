@@ -13,66 +13,22 @@ from icheat_usd.kernels.simd import (
     address_of,
     black,
     color_add,
-    is_black,
+    color_product,
     load,
+    load_byte,
+    load_color,
     load_rgb,
     multiply_add,
-    product,
+    plus,
     scale_add,
     store,
     store_color,
     store_rgb,
     weighted_sum,
+    zeros,
 )
 
-ENTRIES = 4  # of a group
 _CHUNK = 1024  # pixels or view samples: what is between two passes over them stays in the first-level cache
-
-
-class InterpolationTable(NamedTuple):
-    """Which products each view sample is the weighted sum of, four at a time.
-
-    Entries that a sample does not need have weight 0 and a row that is read
-    anyway. A row is one of the flat products ``out.reshape(-1, 4)``: 64 times
-    the tile (or the pair of tile and version) plus the lane.
-    """
-
-    row: NDArray[np.int32]  #: (n_view, 4)
-    weight: NDArray[np.float32]  #: (n_view, 4)
-    more_view: NDArray[np.int32]  #: (n_more,) samples with more entries, ascending; once for each four
-    more_row: NDArray[np.int32]  #: (n_more, 4)
-    more_weight: NDArray[np.float32]  #: (n_more, 4)
-
-
-def interpolation_table(
-    indptr: NDArray[np.int64], indices: NDArray[np.int32], weights: NDArray[np.float32]
-) -> InterpolationTable:
-    """The table of a sparse matrix (n_view x n_rows) in compressed rows."""
-    counts = np.diff(indptr)
-    row, weight = _entries(indptr, counts, indices, weights, np.arange(len(counts)), 0)
-    groups = np.maximum(-(-counts // ENTRIES) - 1, 0)
-    view = np.repeat(np.arange(len(counts)), groups)
-    rank = np.arange(len(view)) - np.repeat(np.cumsum(groups) - groups, groups)
-    more_row, more_weight = _entries(indptr, counts, indices, weights, view, ENTRIES * (rank + 1))
-    return InterpolationTable(row, weight, view.astype(np.int32), more_row, more_weight)
-
-
-def _entries(
-    indptr: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    indices: NDArray[np.int32],
-    weights: NDArray[np.float32],
-    view: NDArray[np.int64],
-    skipped: NDArray[np.int64] | int,
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Four entries of each of some samples, behind those `skipped`."""
-    row, weight = np.zeros((len(view), ENTRIES), np.int32), np.zeros((len(view), ENTRIES), np.float32)
-    for k in range(ENTRIES):
-        has = np.flatnonzero(counts[view] > skipped + k)
-        place = (indptr[view] + skipped + k)[has]
-        row[:, k] = row[:, 0]  # already read: a row elsewhere would cost a cache line
-        row[has, k], weight[has, k] = indices[place], weights[place]
-    return row, weight
 
 
 class _Places(NamedTuple):
@@ -80,52 +36,54 @@ class _Places(NamedTuple):
 
     row: int
     weight: int
-    products: int
     tint: int
-    n_lobes: int
+    lobe: int
+    products: int
     products_step: int  # from lobe to lobe
-    tint_step: int
 
 
 @kernel
-def _places(row, weight, products, tint):  # type: ignore[no-untyped-def]
+def _places(row, weight, tint, lobe, products):  # type: ignore[no-untyped-def]
     return _Places(
         address_of(row),
         address_of(weight),
-        address_of(products),
         address_of(tint),
-        len(products),
+        address_of(lobe),
+        address_of(products),
         16 * products.shape[1],
-        12 * tint.shape[1],
     )
 
 
 @kernel
-def _blend_first_lobe(at, first, n, blend):  # type: ignore[no-untyped-def]
-    """Interpolated products of `n` view samples, three floats each; one more is written."""
-    row, weight = at.row + 16 * first, at.weight + 16 * first
+def _blend_run(at, first, n, out):  # type: ignore[no-untyped-def]
+    """Light of the first groups of `n` view samples, three floats each; one more is written."""
+    row, weight, tint, lobe = at.row + 16 * first, at.weight + 16 * first, at.tint + 16 * first, at.lobe + first
     for _ in range(n):
-        store_color(blend, weighted_sum(at.products, row, weight))
+        total = weighted_sum(at.products + load_byte(lobe) * at.products_step, row, load_color(weight))
+        store_color(out, color_product(total, load_color(tint)))
         row += 16
         weight += 16
-        blend += 12
+        tint += 16
+        lobe += 1
+        out += 12
 
 
 @kernel
-def _multiply_run(n, a, b, out):  # type: ignore[no-untyped-def]
-    """``out = a * b`` for `n` colours of three floats."""
-    for _ in range(n // 16):
-        store(out, product(load(a), load(b)))
-        store(out + 64, product(load(a + 64), load(b + 64)))
-        store(out + 128, product(load(a + 128), load(b + 128)))
-        a += 192
-        b += 192
-        out += 192
-    for _ in range(n % 16):
-        store_rgb(out, color_add(load_rgb(a), load_rgb(b), black()))
-        a += 12
-        b += 12
-        out += 12
+def _add_group(at, i, place):  # type: ignore[no-untyped-def]
+    """Add the light of group `i` to a view sample's."""
+    products = at.products + load_byte(at.lobe + i) * at.products_step
+    total = weighted_sum(products, at.row + 16 * i, load_color(at.weight + 16 * i))
+    store_rgb(place, color_add(total, load_color(at.tint + 16 * i), load_rgb(place)))
+
+
+@kernel
+def _indirect_run(first, n, table, products, out):  # type: ignore[no-untyped-def]
+    """Indirect light of `n` view samples to an address, three floats each; one more is written."""
+    row, weight, tint, lobe, more_view, more_row, more_weight, more_tint, more_lobe = table
+    _blend_run(_places(row, weight, tint, lobe, products), first, n, out)
+    more = _places(more_row, more_weight, more_tint, more_lobe, products)
+    for m in range(np.searchsorted(more_view, first), np.searchsorted(more_view, first + n)):
+        _add_group(more, m, out + 12 * (np.int64(more_view[m]) - first))
 
 
 @kernel
@@ -145,60 +103,30 @@ def _add_scaled_run(n, a, gain, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_group(at, i, view, first_lobe, place):  # type: ignore[no-untyped-def]
-    """Add what group `i` gives to a view sample in the lobes from `first_lobe` on, where they are not 0."""
-    row, weight, tint = at.row + 16 * i, at.weight + 16 * i, at.tint + 12 * view
-    total = load_rgb(place)
-    for lobe in range(first_lobe, at.n_lobes):
-        color = load_rgb(tint + lobe * at.tint_step)
-        if not is_black(color):
-            total = color_add(weighted_sum(at.products + lobe * at.products_step, row, weight), color, total)
-    store_rgb(place, total)
-
-
-@kernel
-def _indirect_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, out):  # type: ignore[no-untyped-def]
-    """Indirect light of `n` view samples to an address, three floats each."""
-    at = _places(row, weight, products, tint)
-    blend = np.empty(3 * n + 1, np.float32)
-    _blend_first_lobe(at, first, n, address_of(blend))
-    _multiply_run(n, address_of(blend), at.tint + 12 * first, out)
-    if at.n_lobes > 1:
-        for v in range(first, first + n):
-            _add_group(at, v, v, 1, out + 12 * (v - first))
-    more = _places(more_row, more_weight, products, tint)
-    for m in range(np.searchsorted(more_view, first), np.searchsorted(more_view, first + n)):
-        v = np.int64(more_view[m])
-        _add_group(more, m, v, 0, out + 12 * (v - first))
-    # Numba may free an array after its last mention, and addresses do not count.
-    blend[0] = np.float32(0.0)
-
-
-@kernel
-def _view_chunk(first, n, row, weight, more_view, more_row, more_weight, products, tint, out):  # type: ignore[no-untyped-def]
-    place = address_of(out) + 12 * first
-    _indirect_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, place)
+def _view_chunk(first, n, table, products, out):  # type: ignore[no-untyped-def]
+    sent = np.empty(3 * n + 1, np.float32)
+    _indirect_run(first, n, table, products, address_of(sent))
+    values = out.reshape(-1)
+    for i in range(3 * n):
+        values[3 * first + i] = sent[i]
 
 
 @parallel_kernel
-def assemble_view(row, weight, more_view, more_row, more_weight, products, tint, out):  # type: ignore[no-untyped-def]
+def assemble_view(table, products, out):  # type: ignore[no-untyped-def]
     """Indirect light of view samples.
 
     Parameters
     ----------
-    row, weight, more_view, more_row, more_weight
-        An `InterpolationTable`.
+    table
+        The columns of a `FilmTable`.
     products : (n_lobes, n_rows, 4) float32
         Products of each lobe's rows, and a pad.
-    tint : (n_lobes, n_view, 3) float32
-        Factor of each lobe; a lobe costs little where it is 0.
     out : (n_view, 3) float32
     """
     n = len(out)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         first = chunk * _CHUNK
-        count = min(n - first, _CHUNK)
-        _view_chunk(first, count, row, weight, more_view, more_row, more_weight, products, tint, out)
+        _view_chunk(first, min(n - first, _CHUNK), table, products, out)
 
 
 @kernel
@@ -225,39 +153,47 @@ def _replace_run(first, n, own_view, own, touched, sent):  # type: ignore[no-unt
 
 
 @kernel
-def _sent_run(  # type: ignore[no-untyped-def]
-    first,
-    n,
-    row,
-    weight,
-    more_view,
-    more_row,
-    more_weight,
-    products,
-    tint,
-    own_view,
-    own,
-    touched,
-    direct,
-    gains,
-    dimmed_view,
-    throughput,
-    sent,
-):
-    """Direct and indirect light of `n` view samples times their throughput to `sent` (n, 3)."""
-    out = address_of(sent)
-    _indirect_run(first, n, row, weight, more_view, more_row, more_weight, products, tint, out)
-    _replace_run(first, n, own_view, own, touched, sent)
-    gain = np.empty(48, np.float32)
-    for light in range(len(direct)):
-        for i in range(48):
-            gain[i] = gains[light, i % 3]
-        place = address_of(direct) + 12 * (light * direct.shape[1] + first)
-        _add_scaled_run(n, place, address_of(gain), out)
+def _add_direct(first, n, direct, indirect, out):  # type: ignore[no-untyped-def]
+    """Indirect light, from its address, and direct light of `n` view samples to `out`, which may be the same."""
+    kept, lights, gains = direct
+    some = address_of(kept) + 12 * first
+    light_0 = address_of(lights) + 12 * first
+    step = 12 * lights.shape[1]
+    gain_0 = address_of(gains)
+    is_kept = len(kept) > 0
+    for _ in range(n // 16):
+        for third in range(3):
+            total = load(some + 64 * third) if is_kept else zeros()
+            light, gain = light_0 + 64 * third, gain_0 + 64 * third
+            for _ in range(len(gains)):
+                total = multiply_add(load(light), load(gain), total)
+                light += step
+                gain += 192
+            store(out + 64 * third, plus(load(indirect + 64 * third), total))
+        some += 192
+        light_0 += 192
+        indirect += 192
+        out += 192
+    for _ in range(n % 16):
+        one = load_rgb(some) if is_kept else black()
+        light, gain = light_0, gain_0
+        for _ in range(len(gains)):
+            one = color_add(load_rgb(light), load_rgb(gain), one)
+            light += step
+            gain += 192
+        store_rgb(out, scale_add(load_rgb(indirect), np.float32(1.0), one))
+        some += 12
+        light_0 += 12
+        indirect += 12
+        out += 12
+
+
+@kernel
+def _dim(first, n, dimmed_view, throughput, sent):  # type: ignore[no-untyped-def]
+    """Multiply the light `sent` (n, 3) of view samples with their throughput."""
     for k in range(np.searchsorted(dimmed_view, first), np.searchsorted(dimmed_view, first + n)):
         for c in range(3):
             sent[dimmed_view[k] - first, c] *= throughput[k, c]
-    gain[0] = np.float32(0.0)  # keeps it, see `_indirect_run`
 
 
 @kernel
@@ -270,7 +206,7 @@ def _sum_run(first, n, values, gains, out):  # type: ignore[no-untyped-def]
         for i in range(48):
             gain[i] = gains[light, i % 3]
         _add_scaled_run(n, address_of(values) + 12 * (light * values.shape[1] + first), address_of(gain), place)
-    gain[0] = np.float32(0.0)  # keeps it, see `_indirect_run`
+    gain[0] = np.float32(0.0)  # Numba may free an array after its last mention, and addresses do not count.
 
 
 @parallel_kernel
@@ -300,55 +236,24 @@ def _sum_samples(begin, end, sample_begin, sent, film):  # type: ignore[no-untyp
 
 
 @kernel
-def _film_chunk(  # type: ignore[no-untyped-def]
-    begin,
-    end,
-    row,
-    weight,
-    more_view,
-    more_row,
-    more_weight,
-    products,
-    tint,
-    own_view,
-    own,
-    touched,
-    direct,
-    gains,
-    dimmed_view,
-    throughput,
-    sample_begin,
-    in_order,
-    still_pixel,
-    still,
-    film,
-):
+def _film_chunk(begin, end, table, products, own, direct, seen, in_order, film):  # type: ignore[no-untyped-def]
+    own_view, own_light, touched = own
+    dimmed_view, throughput, sample_begin, _, still_pixel, still = seen
     base = address_of(film)
     first = np.int64(sample_begin[begin])
     n = np.int64(sample_begin[end]) - first
-    sent = film[begin:end] if in_order else np.empty((n, 3), np.float32)
-    _sent_run(
-        first,
-        n,
-        row,
-        weight,
-        more_view,
-        more_row,
-        more_weight,
-        products,
-        tint,
-        own_view,
-        own,
-        touched,
-        direct,
-        gains,
-        dimmed_view,
-        throughput,
-        sent,
-    )
-    if not in_order:
-        _sum_samples(begin, end, sample_begin, address_of(sent), base)
-        sent[:1] = np.float32(0.0)  # keeps it, see `_indirect_run`
+    buffer = np.empty(3 * n + 1, np.float32)
+    indirect = address_of(buffer)
+    _indirect_run(first, n, table, products, indirect)
+    _replace_run(first, n, own_view, own_light, touched, buffer[: 3 * n].reshape(n, 3))
+    if in_order:
+        _add_direct(first, n, direct, indirect, base + 12 * begin)
+        _dim(first, n, dimmed_view, throughput, film[begin:end])
+    else:
+        _add_direct(first, n, direct, indirect, indirect)
+        _dim(first, n, dimmed_view, throughput, buffer[: 3 * n].reshape(n, 3))
+        _sum_samples(begin, end, sample_begin, indirect, base)
+    buffer[0] = np.float32(0.0)  # keeps it, see `_sum_run`
     for s in range(np.searchsorted(still_pixel, begin), np.searchsorted(still_pixel, end)):
         place = base + 12 * np.int64(still_pixel[s])
         store_rgb(place, scale_add(load_rgb(address_of(still) + 12 * s), np.float32(1.0), load_rgb(place)))
@@ -361,51 +266,23 @@ def chunks_in_order(sample_begin: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 
 @parallel_kernel
-def assemble_film(  # type: ignore[no-untyped-def]
-    row,
-    weight,
-    more_view,
-    more_row,
-    more_weight,
-    products,
-    tint,
-    own_view,
-    own,
-    touched,
-    direct,
-    gains,
-    dimmed_view,
-    throughput,
-    sample_begin,
-    in_order,
-    still_pixel,
-    still,
-    film,
-):
-    """Image of direct and indirect light; the first seven arguments are those of `assemble_view`.
+def assemble_film(table, products, own, direct, seen, film):  # type: ignore[no-untyped-def]
+    """Image of direct and indirect light; `table` and `products` are those of `assemble_view`.
 
     Parameters
     ----------
-    own_view : (n_own,) int32
-        View samples, ascending, whose indirect light is not interpolated.
-    own : (n_view, 3) float32
-        Theirs.
-    touched : (n_view,) or (0,) bool
-        View samples whose indirect light is held at 0 or above.
-    direct : (n_lights, n_view, 3) float32
-        Reflected direct light of each light at gain 1.
-    gains : (n_lights, 3) float32
-    dimmed_view : (n_dimmed,) int32
-        View samples, ascending, whose throughput is not 1.
-    throughput : (n_dimmed, 3) float32
-    sample_begin : (n_pixels + 1,) int32
-        First view sample of each pixel.
-    in_order : (n_chunks,) bool
-        Of `chunks_in_order`.
-    still_pixel : (n_still,) int32
-        Pixels that emit or show the background, ascending, each once.
-    still : (n_still, 3) float32
-        What they add.
+    own
+        ``(own_view, own_light, touched)``: (n_own,) int32 view samples, ascending, whose indirect light is not
+        interpolated; theirs, (n_view, 3) float32; and which view samples' indirect light is held at 0 or above,
+        (n_view,) or (0,) bool.
+    direct
+        ``(kept, lights, gains)``: the sum of the first lights' reflected direct light, (n_view, 3) or (0, 3);
+        that of each of the others at gain 1, (n_lights, n_view, 3); and their gains, each 16 times, (n_lights, 48).
+    seen
+        ``(dimmed_view, throughput, sample_begin, in_order, still_pixel, still)``: (n_dimmed,) int32 view samples,
+        ascending, whose throughput is not 1, and theirs, (n_dimmed, 3); the first view sample of each pixel,
+        (n_pixels + 1,) int32; `chunks_in_order`; and pixels that emit or show the background, (n_still,) int32
+        ascending, each once, with what they add, (n_still, 3).
     film : (n_pixels, 3) float32
 
     Notes
@@ -413,27 +290,7 @@ def assemble_film(  # type: ignore[no-untyped-def]
     A pixel's sums run in one order: the same bits for any number of threads.
     """
     n = len(film)
+    in_order = seen[3]
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        _film_chunk(
-            chunk * _CHUNK,
-            min(n, (chunk + 1) * _CHUNK),
-            row,
-            weight,
-            more_view,
-            more_row,
-            more_weight,
-            products,
-            tint,
-            own_view,
-            own,
-            touched,
-            direct,
-            gains,
-            dimmed_view,
-            throughput,
-            sample_begin,
-            in_order[chunk],
-            still_pixel,
-            still,
-            film,
-        )
+        begin = chunk * _CHUNK
+        _film_chunk(begin, min(n, begin + _CHUNK), table, products, own, direct, seen, in_order[chunk], film)

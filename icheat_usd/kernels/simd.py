@@ -237,32 +237,36 @@ def store_rgb(builder: Any, values: Any) -> None:
     builder.store(rgb, _at(builder, values[0], ir.VectorType(_F32, 3)), align=4)
 
 
-@_operation(color, types.int64, types.int64, types.int64)
+@_operation(types.int64, types.int64)
+def load_byte(builder: Any, values: Any) -> Any:
+    """A whole number of 8 bits, from 0 up, from an address."""
+    return builder.zext(builder.load(_at(builder, values[0], _I8)), ir.IntType(64))
+
+
+@_operation(color, types.int64, types.int64, color)
 def weighted_sum(builder: Any, values: Any) -> Any:
-    """Sum of four colours: addresses of the first colour, of four int32 that count colours from it, of four weights."""
+    """Sum of four colours: addresses of the first colour and of four int32 that count colours from it; four weights."""
     total = ir.Constant(_F4X, [0.0] * 4)
     for k in range(4):
         skip = ir.Constant(ir.IntType(64), 4 * k)
         index = builder.load(_at(builder, builder.add(values[1], skip), _I32), align=4)
-        weight = builder.load(_at(builder, builder.add(values[2], skip), _F32), align=4)
+        weight = _picked(builder, values[2], values[2], [k] * 4)
         offset = builder.shl(builder.sext(index, ir.IntType(64)), ir.Constant(ir.IntType(64), 4))
         value = _load(builder, builder.add(values[0], offset), _F4X)
-        total = _call(builder, "llvm.fmuladd.v4f32", _F4X, value, _spread(builder, weight, _F4X), total)
+        total = _call(builder, "llvm.fmuladd.v4f32", _F4X, value, weight, total)
     return total
-
-
-@_operation(types.boolean, color)
-def is_black(builder: Any, values: Any) -> Any:
-    """Whether red, green and blue are all 0."""
-    rgb = _picked(builder, values[0], values[0], [0, 1, 2])
-    bits = builder.bitcast(builder.fcmp_unordered("!=", rgb, ir.Constant(rgb.type, [0.0] * 3)), ir.IntType(3))
-    return builder.icmp_unsigned("==", bits, ir.Constant(ir.IntType(3), 0))
 
 
 @_operation(color, color, types.float32)
 def scaled(builder: Any, values: Any) -> Any:
     """A colour times a number."""
     return builder.fmul(values[0], _spread(builder, values[1], _F4X))
+
+
+@_operation(color, color, color)
+def color_product(builder: Any, values: Any) -> Any:
+    """``a * b`` channel by channel."""
+    return builder.fmul(*values)
 
 
 @_operation(color, color, types.float32, color)

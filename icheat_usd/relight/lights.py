@@ -25,6 +25,7 @@ class _Light:
     work: AnyLight | MovingLight | None = None
     bins: BinnedSky | None = None  #: of a dome's image
     direct: F32 | None = None  #: at the cells, of which the present radiance came
+    moved: int = 0  #: what `LiveLights.moves` was at its last change
 
 
 class LiveLights:
@@ -86,6 +87,11 @@ class LiveLights:
     def total(self) -> F32:
         """Radiance `b` that leaves each gather cell under the gains, (n_gather, 3)."""
         return sum_lights(self.radiance * self.gains[:, None, :])
+
+    @property
+    def light_moves(self) -> list[int]:
+        """What `moves` was when each light last changed but for its gain, (n_lights,)."""
+        return [state.moved for state in self._lights]
 
     def direct(self) -> F32:
         """Direct light that each view sample reflects under the gains, (n_view, 3)."""
@@ -172,7 +178,7 @@ class LiveLights:
                 if not more:
                     state.work = None
                 self.revision += 1
-                self.moves += 1
+                self.moves = state.moved = self.moves + 1
                 break
         return any(state.work is not None for state in self._lights)
 
@@ -199,4 +205,4 @@ class LiveLights:
         state.work, state.direct = work, work.direct
         state.bins = work.bins if isinstance(work, AnyLight) else None
         self.revision += 1
-        self.moves += 1
+        self.moves = state.moved = self.moves + 1

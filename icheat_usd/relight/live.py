@@ -15,8 +15,10 @@ from icheat_usd.edits.model import EditStack, SurfaceMask
 from icheat_usd.errors import EditError, SampleSetMismatch
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.kernels.assemble import sum_scaled
+from icheat_usd.kernels.film_table import FilmTable, film_table
 from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.compiled import Way
+from icheat_usd.relight.direct_sum import DirectSum
 from icheat_usd.relight.groups import SampleGroups, TermTable
 from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
 from icheat_usd.relight.narrow import Narrow
@@ -77,7 +79,7 @@ class LiveRelighter:
         self._snapshot = snapshot
         self._albedo = np.ascontiguousarray(view.points.albedo)
         self._seen = seen_samples(view)
-        self._film: F32 = np.zeros((view.width * view.height, 3), np.float32)
+        self._direct = DirectSum()
         self._base: F32 = np.zeros((view.n, 3), np.float32)
         self._base_stale = True
         self._own: F32 = np.zeros((view.n, 3), np.float32)  # of samples that do not share their light with a group
@@ -102,6 +104,7 @@ class LiveRelighter:
             self._refuse_pairs()
         self.transport = transport
         self._products = Products(transport, self.gather.tree)
+        self._table = _table(self._products)
         self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
         self._exact_products: Products | None = None
         self._n_exact = 0  # tiles of exact rows that the unedited light has
@@ -226,14 +229,18 @@ class LiveRelighter:
         out : (height, width, 3) float32, optional
             Where to put it.
         """
+        shape = (self.view.height, self.view.width, 3)
+        image = np.empty(shape, np.float32) if out is None else out
+        if image.shape != shape or image.dtype != np.float32:
+            raise SampleSetMismatch(f"an image of shape {image.shape} {image.dtype} cannot hold {shape} float32")
         self._update()
-        image = self._film.reshape(self.view.height, self.view.width, 3)
-        if out is None:
-            return image.copy()
-        if out.shape != image.shape or out.dtype != np.float32:
-            raise SampleSetMismatch(f"an image of shape {out.shape} {out.dtype} cannot hold {image.shape} float32")
-        np.copyto(out, image)
-        return out
+        lights = self.lights
+        direct = self._direct.now(lights.view_direct, lights.gains, getattr(lights, "light_moves", None))
+        film = image.reshape(-1, 3) if image.flags.c_contiguous else np.empty((shape[0] * shape[1], 3), np.float32)
+        self._shared.film(self._own_light, direct, self._seen, film)
+        if film.base is not image and film is not image:
+            image[:] = film.reshape(shape)
+        return image
 
     def relit(self) -> RelitView:
         """Light of every view sample, in layers."""
@@ -302,7 +309,7 @@ class LiveRelighter:
         self._groups = SampleGroups(stack.compiled, self.view.n, divided)
         self._versions = Versions(stack.compiled, self._products, self._pair_products, self.gather.area)
         self._terms = TermTables(stack.compiled, self._groups, self._versions)
-        self._shared = SharedLight(self._products, self.view.n)
+        self._shared = SharedLight(self._products, self._table)
         self._changed_rows: set[int] = set()
         self._changed_samples: list[I64] = []
         self._samples_of: dict[frozenset[int], I64] = {}
@@ -402,11 +409,9 @@ class LiveRelighter:
         self._changed_rows, self._changed_samples = set(), []
 
     def _show(self, samples: I64) -> None:
-        """Put the image together, after some samples that do not share their light have changed."""
+        """Add up what groups share, and find the light of some samples that do not share theirs."""
         self._shared.add_up(self._terms.light, self._versions)
         self._edit(samples)
-        lights = self.lights
-        self._shared.film(self._own_light, lights.view_direct, lights.gains, self._seen, self._film)
 
     def _unedited(self) -> F32:
         """Unedited indirect light of all view samples."""
@@ -447,6 +452,8 @@ class LiveRelighter:
 
     def _edit(self, samples: I64) -> None:
         """Find the light of those of some samples that do not share theirs."""
+        if not len(self._mixed_samples):
+            return
         samples = samples[self._mixed[samples]]
         idle = samples[~self._touched[samples]]
         if len(idle):
@@ -494,3 +501,12 @@ class LiveRelighter:
         for row in np.flatnonzero(stack.compiled.way == Way.VIEW):
             masks[row] = stack.receiver_masks[row, samples]
         return Ends(masks, None, ())
+
+
+def _table(products: Products) -> FilmTable:
+    """What view samples are interpolated from."""
+    spread, n_view = products.interpolation, products.tints.shape[1]
+    if products.is_sparse:
+        return film_table(spread.indptr, spread.indices, spread.weights, products.tints)
+    row, begin = np.arange(n_view, dtype=np.int32), np.arange(n_view + 1, dtype=np.int64)
+    return film_table(begin, row, np.ones(n_view, np.float32), products.tints)

@@ -7,13 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
-from icheat_usd.kernels.assemble import (
-    InterpolationTable,
-    assemble_film,
-    assemble_view,
-    chunks_in_order,
-    interpolation_table,
-)
+from icheat_usd.kernels.assemble import assemble_film, assemble_view, chunks_in_order
+from icheat_usd.kernels.film_table import FilmTable
+from icheat_usd.relight.direct_sum import SummedLight
 from icheat_usd.relight.groups import SampleGroups, TermTable
 from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.products import Products
@@ -60,15 +56,9 @@ class SharedLight:
     instead of the unedited products, so that an edit costs a pixel nothing.
     """
 
-    def __init__(self, products: Products, n_view: int) -> None:
+    def __init__(self, products: Products, table: FilmTable) -> None:
         self._products = products
-        spread = products.interpolation
-        if products.is_sparse:
-            self._base = interpolation_table(spread.indptr, spread.indices, spread.weights)
-        else:
-            row = np.arange(n_view, dtype=np.int32)
-            self._base = interpolation_table(np.arange(n_view + 1, dtype=np.int64), row, np.ones(n_view, np.float32))
-        base = self._base
+        self._base = base = table
         self._edited = base._replace(row=base.row.copy(), more_row=base.more_row.copy())
         self._of: I32 = np.zeros((0, products.n_tiles), np.int32)
         self._tile: I32 = np.zeros(0, np.int32)
@@ -144,17 +134,17 @@ class SharedLight:
         """Indirect light of all view samples into `out`: edited where a group shares it, else unedited."""
         self._assemble(self._edited, out)
 
-    def film(self, own: OwnLight, lights: F32, gains: F32, seen: SeenSamples, out: F32) -> None:
-        """The image with direct light (n_lights, n_view, 3) under gains into `out` (n_pixels, 3)."""
-        assemble_film(*self._edited, self._flat_sums, self._products.tints, *own, lights, gains, *seen, out)
+    def film(self, own: OwnLight, direct: SummedLight, seen: SeenSamples, out: F32) -> None:
+        """The image with direct light into `out` (n_pixels, 3)."""
+        assemble_film(tuple(self._edited), self._flat_sums, tuple(own), tuple(direct), tuple(seen), out)
 
     @property
     def _flat_sums(self) -> F32:
         n_lobes, n_sums = self._sums.shape[:2]
         return self._sums.reshape(n_lobes, n_sums * LANES, 4)
 
-    def _assemble(self, table: InterpolationTable, out: F32) -> None:
-        assemble_view(*table, self._flat_sums, self._products.tints, out)
+    def _assemble(self, table: FilmTable, out: F32) -> None:
+        assemble_view(tuple(table), self._flat_sums, out)
 
 
 def _entries_of(view: I32, samples: I64) -> I64:

@@ -6,14 +6,9 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.assemble import (
-    InterpolationTable,
-    assemble_film,
-    assemble_view,
-    chunks_in_order,
-    interpolation_table,
-    sum_scaled,
-)
+from icheat_usd.kernels.assemble import assemble_film, assemble_view, chunks_in_order, sum_scaled
+from icheat_usd.kernels.film_table import FilmTable, film_table
+from icheat_usd.relight.direct_sum import DirectSum
 from icheat_usd.scene import F32, F64, I32
 from icheat_usd.transport import SparseRows
 
@@ -35,8 +30,8 @@ def colors(*shape: int, seed: int = 1) -> F32:
     return np.random.default_rng(seed).uniform(0, 2, shape).astype(np.float32)
 
 
-def table_of(rows: SparseRows) -> InterpolationTable:
-    return interpolation_table(rows.indptr, rows.indices, rows.weights)
+def table_of(rows: SparseRows, tint: F32) -> FilmTable:
+    return film_table(rows.indptr, rows.indices, rows.weights, tint)
 
 
 def expected_view(rows: SparseRows, products: F32, tint: F32) -> F64:
@@ -49,15 +44,26 @@ COUNTS = np.random.default_rng(2).integers(0, 10, 5000).astype(np.int32)  # more
 
 
 def test_view_samples_are_interpolated_and_tinted() -> None:
-    rows, products, tint = interpolation(COUNTS), colors(2, N_ROWS, 4), colors(2, len(COUNTS), 3)
+    rows, products, tint = interpolation(COUNTS), colors(3, N_ROWS, 4), colors(3, len(COUNTS), 3)
     tint[1, ::3] = 0
+    tint[0, 1::3] = 0
+    tint[2, 2::5] = 0
     out = np.full((len(COUNTS), 3), np.nan, np.float32)
-    assemble_view(*table_of(rows), products, tint, out)
+    assemble_view(tuple(table_of(rows, tint)), products, out)
     np.testing.assert_allclose(out, expected_view(rows, products, tint), rtol=2e-6, atol=1e-7)
 
 
+def test_no_lobes_give_no_light() -> None:
+    rows = interpolation(COUNTS)
+    out = np.full((len(COUNTS), 3), np.nan, np.float32)
+    none = np.zeros((0, len(COUNTS), 3), np.float32)
+    assemble_view(tuple(table_of(rows, none)), np.zeros((1, N_ROWS, 4), np.float32), out)
+    assert not out.any()
+
+
+@pytest.mark.parametrize("n_kept", [0, 1, 3])
 @pytest.mark.parametrize("samples", ["one", "varied"])
-def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
+def test_film_adds_direct_light_and_what_stays(samples: str, n_kept: int) -> None:
     rng = np.random.default_rng(3)
     n_pixels = 4500
     per_pixel = np.ones(n_pixels, np.int64)
@@ -66,7 +72,7 @@ def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
     pixel = np.repeat(np.arange(n_pixels), per_pixel).astype(np.int32)
     n = len(pixel)
     rows = interpolation(rng.integers(1, 9, n).astype(np.int32))
-    products, tint, direct, gains = colors(1, N_ROWS, 4), colors(1, n, 3), colors(2, n, 3), colors(2, 3)
+    products, tint, direct, gains = colors(1, N_ROWS, 4), colors(1, n, 3), colors(3, n, 3), colors(3, 3)
     dimmed_view = np.sort(rng.choice(n, 0 if samples == "one" else 1500, replace=False)).astype(np.int32)
     throughput = np.ones((n, 3), np.float32)
     throughput[dimmed_view] = colors(len(dimmed_view), 3)
@@ -83,6 +89,9 @@ def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
     expected = np.zeros((n_pixels, 3))
     np.add.at(expected, pixel, sent * throughput)
     expected[still_pixel] += still
+    kept = np.empty((n if n_kept else 0, 3), np.float32)
+    sum_scaled(direct[:n_kept], gains[:n_kept], kept)
+    summed = (kept, direct[n_kept:], np.tile(gains[n_kept:], (1, 16)))
     films = []
     before = numba.get_num_threads()
     try:
@@ -91,7 +100,7 @@ def test_film_adds_direct_light_and_what_stays(samples: str) -> None:
             film = np.full((n_pixels, 3), np.nan, np.float32)
             edited = (own_view, own, touched)
             seen = (dimmed_view, throughput[dimmed_view], begin, chunks_in_order(begin), still_pixel, still)
-            assemble_film(*table_of(rows), products, tint, *edited, direct, gains, *seen, film)
+            assemble_film(tuple(table_of(rows, tint)), products, edited, summed, seen, film)
             films.append(film)
     finally:
         numba.set_num_threads(before)
@@ -106,9 +115,42 @@ def test_sum_of_lights() -> None:
     np.testing.assert_allclose(out, (values.astype(np.float64) * gains[:, None]).sum(axis=0), rtol=1e-6)
 
 
+def test_what_is_kept_of_direct_light_does_not_show_in_the_bits() -> None:
+    direct, gains = colors(4, 2500, 3), colors(4, 3)
+    nothing = np.zeros(0, np.int32)
+    begin = np.arange(2501, dtype=np.int32)
+    seen = (nothing, np.zeros((0, 3), np.float32), begin, chunks_in_order(begin), nothing, np.zeros((0, 3), np.float32))
+    own = (nothing, np.zeros((0, 3), np.float32), np.zeros(0, np.bool_))
+    rows, tint = interpolation(np.full(2500, 3, np.int32)), colors(1, 2500, 3)
+    table, products = tuple(table_of(rows, tint)), colors(1, N_ROWS, 4)
+    expected = np.empty((2500, 3), np.float32)
+    whole = (np.zeros((0, 3), np.float32), direct, np.tile(gains, (1, 16)))
+    assemble_film(table, products, own, whole, seen, expected)
+    sums, moves = DirectSum(), [0, 0, 0, 0]
+    for changed in (None, None, 2, 2, None, 0, 3, None):
+        if changed is not None:
+            gains[changed] += np.float32(0.25)
+            moves[changed] += changed % 2
+            whole = (whole[0], direct, np.tile(gains, (1, 16)))
+            assemble_film(table, products, own, whole, seen, expected)
+        found = np.empty((2500, 3), np.float32)
+        assemble_film(table, products, own, tuple(sums.now(direct, gains, moves)), seen, found)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_light_that_moved_is_not_kept() -> None:
+    direct, gains, sums = colors(3, 100, 3), colors(3, 3), DirectSum()
+    assert [len(sums.now(direct, gains, [1, 1, 1]).gains) for _ in range(3)] == [3, 0, 0]
+    direct[1] *= 2
+    now = sums.now(direct, gains, [1, 5, 1])
+    assert len(now.gains) == 2
+    np.testing.assert_allclose(now.kept, direct[0] * gains[0], rtol=1e-6)
+    assert len(sums.now(direct, gains, None).gains) == 3
+
+
 def test_weights_of_the_table_are_those_of_the_matrix() -> None:
-    rows = interpolation(COUNTS)
-    table = table_of(rows)
+    rows, tint = interpolation(COUNTS), np.ones((1, len(COUNTS), 3), np.float32)
+    table = table_of(rows, tint)
     total = table.weight.sum(axis=1, dtype=np.float64)
     np.add.at(total, table.more_view, table.more_weight.sum(axis=1, dtype=np.float64))
     np.testing.assert_allclose(total, np.where(COUNTS > 0, 1, 0), atol=1e-6)

@@ -20,7 +20,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from icheat_usd.kernels.assemble import assemble_film, chunks_in_order, interpolation_table
+from icheat_usd.kernels.assemble import assemble_film, chunks_in_order, sum_scaled
+from icheat_usd.kernels.film_table import film_table
 from icheat_usd.kernels.packed import LANES, PairedTiles, multiply_paired_tiles, multiply_tiles, pair_coefficients
 from icheat_usd.kernels.simd import address_of, load, multiply_add, spread, store, zeros
 from icheat_usd.samples import ViewSamples
@@ -320,9 +321,11 @@ def measure_frame(
     if spread_rows is None:
         n = view.n
         spread_rows = SparseRows(np.arange(n + 1), np.arange(n, dtype=np.int32), np.ones(n, np.float32), n)
-    table = interpolation_table(spread_rows.indptr, spread_rows.indices, spread_rows.weights)
     tint = np.stack([lobe.tint for lobe in packed.lobes if len(lobe.rows.index)])
-    gains = np.ones((len(direct), 3), np.float32)
+    table = tuple(film_table(spread_rows.indptr, spread_rows.indices, spread_rows.weights, tint))
+    kept = np.empty(direct.shape[1:], np.float32)
+    sum_scaled(direct, np.ones((len(direct), 3), np.float32), kept)
+    summed = (kept, direct[:0], np.zeros((0, 48), np.float32))
     n_pixels = view.width * view.height
     sample_begin = np.searchsorted(view.pixel, np.arange(n_pixels + 1)).astype(np.int32)
     dimmed = np.flatnonzero((view.throughput != 1).any(axis=1)).astype(np.int32)
@@ -344,7 +347,7 @@ def measure_frame(
             item.in_integers()
 
     def pixels() -> None:
-        assemble_film(*table, out, tint, *unedited, direct, gains, *seen, film)
+        assemble_film(table, out, unedited, summed, seen, film)
 
     def frame() -> None:
         haar()
@@ -354,11 +357,7 @@ def measure_frame(
     sizes = {
         "Haar transform": values.nbytes + 16 * len(b) + 16 * len(b),
         "product": sum(item.rows.n_bytes for item in products),
-        "pixels": sum(column.nbytes for column in table)
-        + tint.nbytes
-        + direct.nbytes
-        + view.throughput[dimmed].nbytes
-        + film.nbytes,
+        "pixels": sum(column.nbytes for column in table) + kept.nbytes + view.throughput[dimmed].nbytes + film.nbytes,
     }
     contenders: dict[tuple[str, int], tuple[Work, int]] = {}
     for threads in (1, 2):
