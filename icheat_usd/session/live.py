@@ -344,13 +344,17 @@ class LiveSession(LiveAuthoring):
         with self._frames.command():
             return self._history.redo(self._go)
 
-    def _go(self, state: LiveState, written: Sequence[tuple[LayerVersion, LayerVersion]]) -> None:
+    def _go(
+        self, state: LiveState, written: Sequence[tuple[LayerVersion, LayerVersion]], is_about_lights: bool
+    ) -> None:
         with self._frames.stage_lock:
             for now, then in written:
                 go_to_version(now, then)
         if written:
             self._frames.stacks_changed()
         self._frames.set_state(state)
+        if is_about_lights:
+            self._frames.lights_changed()
 
     # Time -------------------------------------------------------------------------------------------------------------
 

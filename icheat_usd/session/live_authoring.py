@@ -13,6 +13,7 @@ from icheat_usd.errors import IcheatError
 from icheat_usd.scene import Finding
 from icheat_usd.session import authoring
 from icheat_usd.session.commit import write_changes
+from icheat_usd.session.commit_lights import write_lights
 from icheat_usd.session.document import Session
 from icheat_usd.session.live_frames import LiveFrames
 from icheat_usd.session.live_history import LiveHistory, Step
@@ -42,7 +43,7 @@ class LiveAuthoring:
     ) -> tuple[Finding, ...]:
         """Write what was changed about edits to a layer and save it, as one step that can be undone.
 
-        Changes of lights stay what they are: changes that are shown.
+        Changes of lights stay what they are, changes that are shown; `commit_lights` writes them.
 
         Parameters
         ----------
@@ -68,6 +69,39 @@ class LiveAuthoring:
             return write_changes(session, changes, stack, layer=layer, frame=frame, sidecar=sidecar, why=why)
 
         return self._author("commit", layer, write, replace(changes, edits=UNCHANGED.edits, order=()))
+
+    def commit_lights(self, layer: str, *, frame: float | None = None, why: str = "") -> tuple[Finding, ...]:
+        """Write what was changed about lights to a layer and save it, as one step that can be undone.
+
+        A light that was moved gets one matrix, one that was dimmed another intensity, one that was recoloured a color
+        and an intensity too; one that was removed is deactivated. Who, when and `why` are kept in the custom data of
+        each. Every frame is made again then, of the rows that are there.
+
+        Parameters
+        ----------
+        frame
+            Stage time to key the values at; without it they hold at all times.
+
+        Returns
+        -------
+        tuple of Finding
+            What has no effect, because a stronger layer decides it.
+
+        Raises
+        ------
+        EditError
+            Something cannot be written, such as a light inside an instance; the layer is then as before.
+        """
+        changes, session = self._frames.state, self.session
+        if not changes.lights:
+            return ()
+        snapshot = self._frames.here().snapshot
+
+        def write() -> tuple[Finding, ...]:
+            return write_lights(session.stage, snapshot, changes, layer=layer, frame=frame, why=why)
+
+        after = replace(changes, lights=UNCHANGED.lights)
+        return self._author("commit lights", layer, write, after, is_about_lights=True)
 
     def add_edit(self, name: str, *, layer: str = "session", **values: Any) -> str:
         """Add an edit to the stack, in the stage's session layer unless said otherwise; see `Session.add_edit`."""
@@ -100,7 +134,15 @@ class LiveAuthoring:
             self._frames.stacks_changed()
             self._frames.set_state(self._frames.state)
 
-    def _author(self, label: str, layer: str, write: Callable[[], Written], after: LiveState | None = None) -> Written:
+    def _author(
+        self,
+        label: str,
+        layer: str,
+        write: Callable[[], Written],
+        after: LiveState | None = None,
+        *,
+        is_about_lights: bool = False,
+    ) -> Written:
         """Write to a layer; after any error the layer and what is shown are as before."""
         with self._frames.command(), self._frames.stage_lock:
             before, state = layer_version(self.session.stage, layer), self._frames.state
@@ -114,5 +156,7 @@ class LiveAuthoring:
                 self._frames.stacks_changed()
                 self._frames.set_state(state)
                 raise
-            self._history.add(Step(label, state, self._frames.state, ((before, made),)))
+            if is_about_lights:
+                self._frames.lights_changed()
+            self._history.add(Step(label, state, self._frames.state, ((before, made),), is_about_lights))
             return result

@@ -12,10 +12,11 @@ from enum import StrEnum
 from icheat_usd.edits.model import EMPTY_STACK, EditStack
 from icheat_usd.errors import IcheatError
 from icheat_usd.kernels._jit import kernels_may_overlap
+from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.progress import silent
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.session import authoring
-from icheat_usd.session.background import Background, Job
+from icheat_usd.session.background import Background, Job, Stopped
 from icheat_usd.session.content_keys import digest
 from icheat_usd.session.dabs import TexelPlaces
 from icheat_usd.session.document import Session
@@ -58,15 +59,16 @@ class LiveEvent:
 
 Listener = Callable[[LiveEvent], None]
 
-#: Frames that another one interrupted whose parts are kept.
+#: Frames whose parts are kept while they are being made, or when another one interrupted them.
 _MOST_UNFINISHED = 2
 
 
 class LiveFrame:
     """One frame: what the stage says at it, and the best that there is to show it with."""
 
-    def __init__(self, snapshot: SceneSnapshot) -> None:
+    def __init__(self, snapshot: SceneSnapshot, lights_version: int) -> None:
         self.snapshot = snapshot
+        self.lights_version = lights_version  #: where it is old, this is kept for what the next one shares with it
         self.stack: EditStack | None = None
         self.stack_version = 0
         self.places = TexelPlaces(snapshot)
@@ -94,9 +96,11 @@ class LiveFrames:
         self.resident.move(session.frame)
         self._shared = SharedParts()
         self._stack_version = 0  #: grows when edits are written to the stage
+        self._lights_version = 0  #: grows when lights are
         self._listeners: list[Listener] = []
         self._failed: dict[tuple[float | None, Level], Exception] = {}
         self._building: dict[tuple[float | None, Level], ShotParts] = {}
+        self._building_version = 0  #: of the lights in `_building`
         self._job: tuple[float | None, Level] = (None, Level.NONE)
         self._background = Background(self._next_job, self._on_error, kernels_may_overlap)
         self._background.start()
@@ -172,6 +176,7 @@ class LiveFrames:
                 frame.evaluator.show(stack, state)
             except IcheatError:
                 frame.evaluator.show(stack, before)
+                self._changed()  # some of it was shown: lights may have to come to rest again
                 raise
         self.state = state
         self._failed.clear()
@@ -189,6 +194,16 @@ class LiveFrames:
         """Edits were written to the stage."""
         self._stack_version += 1
         self._failed.clear()
+
+    def lights_changed(self) -> None:
+        """Lights were written to the stage: every frame is made again, of the same rows."""
+        self._lights_version += 1
+        for number in self.resident.frames():
+            frame = self.resident.get(number)
+            if frame is not None:
+                frame.level = Level.NONE
+        self._failed.clear()
+        self._background.wake(stop_job=True)
 
     def scrub(self, frame: float | None) -> bool:
         """Put the playhead at a frame; whether it can be shown without waiting."""
@@ -261,11 +276,22 @@ class LiveFrames:
         return self.resident.bytes() >= self.resident.limit
 
     def _make(self, number: float | None, level: Level) -> None:
-        began = time.perf_counter()
+        with told_of_compiling(self._compiles):
+            self._make_of_parts(number, level)
+
+    def _make_of_parts(self, number: float | None, level: Level) -> None:
+        began, version = time.perf_counter(), self._lights_version
+        if self._building_version != version:
+            self._building.clear()
+            self._building_version = version
+        if level is Level.PREVIEW and self._parts(number, Level.FULL).is_shared:
+            # Another frame has measured all rows: coarse ones would take longer.
+            level = Level.FULL
+            self._job = number, level
         parts = self._parts(number, level)
         with self._background.lock:
             entry = self.resident.get(number)
-        frame = LiveFrame(parts.snapshot) if entry is None else entry
+        frame = LiveFrame(parts.snapshot, version) if entry is None or entry.lights_version != version else entry
         key = digest(_keys_of_image(parts), parts.snapshot.centre)
         evaluator = self._shared.find("evaluator", key)
         if evaluator is None:
@@ -286,7 +312,7 @@ class LiveFrames:
             assert evaluator is not None
             self._shared.keep("evaluator", key, evaluator)
         self._show(number, frame, evaluator, level, began)
-        self._building.pop((number, level), None)
+        self._forget_parts(number, *((level,) if level is Level.PREVIEW else Level))
 
     def _evaluator(self, parts: ShotParts, transport: Transport | PackedTransport, level: Level) -> Evaluator:
         """At the state already: without the lock, as lights that were changed are worked out here."""
@@ -299,6 +325,8 @@ class LiveFrames:
     def _show(self, number: float | None, frame: LiveFrame, evaluator: Evaluator, level: Level, began: float) -> None:
         """Have a frame shown by something better."""
         with self._background.lock:
+            if frame.lights_version != self._lights_version:
+                raise Stopped
             evaluator.show(self.stack_of(frame), self.state)
             frame.evaluator, frame.level = evaluator, level
             self.resident.put(number, frame, time.perf_counter() - began)
@@ -309,10 +337,10 @@ class LiveFrames:
         if (number, level) not in self._building:
             session = self.session
             quality = session.quality if level is Level.FULL else coarse(session.quality)
-            entry = self.resident.get(number)
-            snapshot = self._read_snapshot(number) if entry is None else entry.snapshot
-            while len(self._building) >= _MOST_UNFINISHED:
-                del self._building[next(iter(self._building))]
+            snapshot = self._snapshot_of(number)
+            others = [frame for frame in dict.fromkeys(frame for frame, _ in self._building) if frame != number]
+            for frame in others[: 1 - _MOST_UNFINISHED]:
+                self._forget_parts(frame, *Level)
             self._building[number, level] = ShotParts(
                 quality,
                 snapshot=snapshot,
@@ -322,6 +350,20 @@ class LiveFrames:
                 memory=self._shared,
             )
         return self._building[number, level]
+
+    def _forget_parts(self, number: float | None, *levels: Level) -> None:
+        for level in levels:
+            self._building.pop((number, level), None)
+
+    def _snapshot_of(self, number: float | None) -> SceneSnapshot:
+        """The stage at a frame, read once for all levels."""
+        building = [parts.snapshot for (frame, _), parts in self._building.items() if frame == number]
+        if building:
+            return building[0]
+        entry = self.resident.get(number)
+        if entry is None or entry.lights_version != self._building_version:
+            return self._read_snapshot(number)
+        return entry.snapshot
 
     def _read_snapshot(self, number: float | None) -> SceneSnapshot:
         """The stage at a frame; tables that are as in a resident frame are the same objects."""
@@ -352,13 +394,16 @@ class LiveFrames:
         self._background.progress()
         self._tell(LiveEvent("progress", self._job[0], self._job[1], step, fraction))
 
+    def _compiles(self, n: int, name: str) -> None:
+        self._tell(LiveEvent("progress", self._job[0], self._job[1], f"first use: compile kernel {n} ({name})"))
+
     def _failure(self) -> Exception | None:
         playhead = self.resident.playhead
         return next((error for (frame, _), error in self._failed.items() if frame == playhead), None)
 
     def _on_error(self, error: Exception) -> None:
         self._failed[self._job] = error
-        self._building.pop(self._job, None)
+        self._forget_parts(self._job[0], *Level)
         self._tell(LiveEvent("error", self._job[0], self._job[1], error=error))
 
     def _tell(self, event: LiveEvent) -> None:

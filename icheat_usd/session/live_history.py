@@ -23,6 +23,7 @@ class Step:
     before: LiveState
     after: LiveState
     written: tuple[tuple[LayerVersion, LayerVersion], ...] = ()  #: layers as they were, and as they were made
+    is_about_lights: bool = False  #: what was written to them
 
 
 class LiveHistory:
@@ -50,22 +51,23 @@ class LiveHistory:
         steps = self._done[first:]
         if steps:
             written = tuple(pair for step in steps for pair in step.written)
-            self._done[first:] = [Step(label, steps[0].before, steps[-1].after, written)]
+            is_about_lights = any(step.is_about_lights for step in steps)
+            self._done[first:] = [Step(label, steps[0].before, steps[-1].after, written, is_about_lights)]
 
-    def undo(self, go: Callable[[LiveState, Written], None]) -> str | None:
+    def undo(self, go: Callable[[LiveState, Written, bool], None]) -> str | None:
         """Have `go` bring back what was before the last step; its label, or None."""
         if not self._done:
             return None
         step = self._done[-1]
-        go(step.before, [(after, before) for before, after in reversed(step.written)])
+        go(step.before, [(after, before) for before, after in reversed(step.written)], step.is_about_lights)
         self._undone.append(self._done.pop())
         return step.label
 
-    def redo(self, go: Callable[[LiveState, Written], None]) -> str | None:
+    def redo(self, go: Callable[[LiveState, Written, bool], None]) -> str | None:
         """Have `go` bring back what was after the step that was undone last; its label, or None."""
         if not self._undone:
             return None
         step = self._undone[-1]
-        go(step.after, step.written)
+        go(step.after, step.written, step.is_about_lights)
         self._done.append(self._undone.pop())
         return step.label

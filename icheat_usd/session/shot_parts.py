@@ -148,6 +148,12 @@ class ShotParts:
 
         return whole() if self._memory is None else self._memory.get("packed", self.keys.packed, whole)
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether another frame in memory has the rows of this one."""
+        kind = "transport" if self.quality.packing_error is None else "packed"
+        return self._memory is not None and self._memory.find(kind, getattr(self.keys, kind)) is not None
+
     def transports(self) -> Iterator[Transport | PackedTransport]:
         """Better and better ones, each usable; the last is what the quality asks for."""
         is_packed = self.quality.packing_error is not None

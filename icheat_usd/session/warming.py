@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import IO
 
 from icheat_usd.errors import IcheatError
 from icheat_usd.resources import resource_path
@@ -75,33 +77,44 @@ def warm(jobs: int | None = None, say: Callable[[str, float], None] = lambda nam
         A task failed.
     """
     limit = jobs or os.cpu_count() or 1
-    waiting, running = list(TASKS), dict[str, tuple[subprocess.Popen[str], float]]()
+    waiting = list(TASKS)
+    running: dict[str, tuple[subprocess.Popen[bytes], float, IO[bytes]]] = {}
     try:
         while waiting or running:
             while waiting and len(running) < limit:
                 name = waiting.pop(0)
-                running[name] = _start(name), time.monotonic()
+                # A file, as a pipe that nobody reads from holds up a process that says much.
+                log: IO[bytes] = tempfile.TemporaryFile()
+                running[name] = _start(name, log), time.monotonic(), log
             time.sleep(0.1)
-            for name, (process, began) in list(running.items()):
+            for name, (process, began, errors) in list(running.items()):
                 if process.poll() is None:
                     continue
                 del running[name]
-                error = process.communicate()[1]
+                last = _last_line(errors)
                 if process.returncode:
-                    last = (error.strip().splitlines() or ["no message"])[-1]
                     raise IcheatError(f"compiling the kernels of '{name}' failed: {last}")
                 say(name, time.monotonic() - began)
     finally:
-        for process, _ in running.values():
+        for process, _, errors in running.values():
             process.terminate()
             process.wait()
+            errors.close()
 
 
-def _start(name: str) -> subprocess.Popen[str]:
+def _last_line(errors: IO[bytes]) -> str:
+    """What a process said last; closes the file."""
+    with errors:
+        errors.seek(0)
+        lines = errors.read().decode(errors="replace").strip().splitlines()
+    return (lines or ["no message"])[-1]
+
+
+def _start(name: str, errors: IO[bytes]) -> subprocess.Popen[bytes]:
     # What is computed here is of no use to anybody.
     environment = os.environ | {"ICHEAT_CACHE_SIZE": "0"}
     code = f"from icheat_usd.session.warming import TASKS; TASKS[{name!r}]()"
     command = [sys.executable, "-c", code]
     return subprocess.Popen(
-        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=errors, stdin=subprocess.DEVNULL
     )

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
+from icheat_usd.errors import EditError
 from icheat_usd.scene import F64, Finding, Geometry, LightKind, Lights, Materials, Surface, Texture, Textures
 from icheat_usd.stage.reporting import Reporter
 from icheat_usd.stage.shading import resolve_input, time_code
@@ -32,6 +33,9 @@ POINT_RADIUS = 1e-3
 
 #: MeshLightAPI's way with materials: the light is the material's emission, tinted by the light's inputs.
 GLOW = "materialGlowTintsLight"
+
+#: Where a dome's pole is Z: a quarter turn about X takes it there from +Y, and longitude 0 from +Z to -Y.
+POLE_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,21 @@ def read_mesh_factors(prims: Iterable[Usd.Prim], time: Usd.TimeCode | float | No
         for prim in prims
         if prim.IsA(UsdGeom.Mesh) and prim.HasAPI(UsdLux.LightAPI) and _material_mode(prim) == GLOW
     }
+
+
+def read_light_radiance(prim: Usd.Prim, time: Usd.TimeCode | float | None) -> F64:
+    """Radiance (3,) of a prim that is a light of a kind that is read; see `read_lights`.
+
+    Raises
+    ------
+    EditError
+        The light gives none, such as one without an area.
+    """
+    reader = _Reader(time_code(time), Placement(1.0, np.zeros(3)), TextureLibrary())
+    rows = reader.kinds[str(prim.GetTypeName())](prim, from_gf(reader.transforms.GetLocalToWorldTransform(prim))[:, :3])
+    if rows is None:
+        raise EditError(f"{prim.GetPath()} has no area and gives no light; give it a size")
+    return rows.radiance
 
 
 def with_mesh_lights(
@@ -254,6 +273,12 @@ def distant_size_factor(half_angle: float) -> float:
     return math.pi * (sine if theta <= math.pi / 2.0 else 2.0 - sine)
 
 
+def pole_axis(prim: Usd.Prim) -> str:
+    """The axis, "Y" or "Z", that a DomeLight_1 has its pole along."""
+    axis = str(prim.GetAttribute("poleAxis").Get() or "scene")
+    return str(UsdGeom.GetStageUpAxis(prim.GetStage())) if axis == "scene" else axis
+
+
 def _material_mode(prim: Usd.Prim) -> str:
     return str(prim.GetAttribute("light:materialSyncMode").Get() or "noMaterialResponse")
 
@@ -335,15 +360,9 @@ class _Reader:
         # Ignores `normalize`: it has no size.
         texture = self._texture(prim, "repeat", "clamp")
         light = self._light(prim, LightKind.DOME, (0.0, 0.0), self.radiance(prim, None, 1.0), texture)
-        if str(prim.GetTypeName()) == "DomeLight_1" and self._pole_axis(prim) == "Z":
-            # A quarter turn about X takes the pole from +Y to +Z, longitude 0 from +Z to -Y.
-            turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-            light.to_world[:, :3] = light.to_world[:, :3] @ turn
+        if str(prim.GetTypeName()) == "DomeLight_1" and pole_axis(prim) == "Z":
+            light.to_world[:, :3] = light.to_world[:, :3] @ POLE_TURN
         return light
-
-    def _pole_axis(self, prim: Usd.Prim) -> str:
-        axis = str(prim.GetAttribute("poleAxis").Get() or "scene")
-        return str(UsdGeom.GetStageUpAxis(prim.GetStage())) if axis == "scene" else axis
 
     def _area_light(
         self, prim: Usd.Prim, kind: LightKind, size: tuple[float, float], area: float, texture: int = -1

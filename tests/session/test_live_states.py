@@ -6,11 +6,13 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
 from icheat_usd.errors import EditError, IcheatError
-from icheat_usd.session import Quality, Session
+from icheat_usd.kernels.compiling import told_of_compiling
+from icheat_usd.session import Quality, Session, shot_parts
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_state import UNCHANGED
 from tests.session.test_session import ROOM
@@ -115,3 +117,57 @@ def test_mistakes_are_one_clear_error(stage: Path) -> None:
             with pytest.raises(EditError, match=named):
                 mistake()
         assert live.undo() is None
+
+
+def test_after_a_refused_command_the_session_comes_to_rest_again(stage: Path) -> None:
+    with open_live(stage) as live:
+        before = live.frame(level="rest")
+        light = next(iter(live.lights))
+        moved = live.lights[light].to_world + np.array([[0, 0, 0, 0.5], [0, 0, 0, 0], [0, 0, 0, 0]])
+        refused = live.state.with_light(light, to_world=moved)
+        refused = refused.with_parameters(live.stack.edits[0].path, {"gain": "nonsense"})
+        with pytest.raises(EditError):
+            live.show(refused)
+        assert live.wait("rest", timeout=300)
+        np.testing.assert_array_equal(live.frame(), before)
+
+
+def test_frames_that_share_rows_need_no_coarse_ones(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the first frame is shown coarsely: the second finds its rows measured, whatever its lights are."""
+    made: list[int] = []
+    build = shot_parts.build_transport
+
+    def counted(*given: object, row_spacing: int, **values: object) -> object:
+        made.append(row_spacing)
+        return build(*given, row_spacing=row_spacing, **values)
+
+    monkeypatch.setattr(shot_parts, "build_transport", counted)
+    text = stage.read_text().replace(
+        "float inputs:intensity = 20", "float inputs:intensity.timeSamples = { 1: 20, 2: 10 }"
+    )
+    path = stage.with_name("pulsing.usda")
+    path.write_text(text)
+    heard: list[tuple[float | None, str]] = []
+    with LiveSession.open(path, width=20, height=15, quality=QUALITY, frame=1.0) as live:
+        live.listen(lambda event: heard.append((event.frame, str(event.level))) if event.kind == "better" else None)
+        first = live.frame(level="rest")
+        live.scrub(2.0)
+        second = live.frame(level="rest")
+    assert made == [8, 1]
+    assert (1.0, "preview") in heard and (2.0, "preview") not in heard[heard.index((2.0, "full")) :]
+    np.testing.assert_allclose(second, first / 2, rtol=1e-3, atol=1e-5)
+
+
+def test_listeners_hear_which_kernels_are_compiled() -> None:
+    heard: list[tuple[int, str]] = []
+
+    def twice(x: float) -> float:
+        return 2 * x
+
+    compiled = numba.njit(twice)
+    with told_of_compiling(lambda n, name: heard.append((n, name))):
+        compiled(1.0)
+        compiled(2.0)
+        compiled(1)
+    compiled(True)
+    assert heard == [(1, "twice"), (2, "twice")]

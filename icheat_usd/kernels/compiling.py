@@ -1,0 +1,34 @@
+"""Tells who waits that kernels are being compiled, which in a new installation takes longer than what they do."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from numba.core import event
+
+
+@contextmanager
+def told_of_compiling(tell: Callable[[int, str], None]) -> Iterator[None]:
+    """Have `tell` called before each kernel that this thread compiles in the block, not for those found on disk.
+
+    It is given how many it has been so far, and the name of this one. It must not raise.
+    """
+    listener = _Listener(tell)
+    with event.install_listener("numba:compile", listener):
+        yield
+
+
+class _Listener(event.Listener):  # type: ignore[misc]
+    def __init__(self, tell: Callable[[int, str], None]) -> None:
+        self._tell, self._thread, self._n = tell, threading.get_ident(), 0
+
+    def on_start(self, event: Any) -> None:
+        if threading.get_ident() == self._thread:
+            self._n += 1
+            self._tell(self._n, event.data["dispatcher"].py_func.__name__)
+
+    def on_end(self, event: Any) -> None:
+        """Nothing to say."""
