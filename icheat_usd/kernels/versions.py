@@ -181,17 +181,20 @@ def _piece_deltas(  # type: ignore[no-untyped-def]
     n_groups = len(b)
     found = np.empty((n_groups, 4, 3))
     total_found = np.zeros((n_groups, 4, 3))
-    value = np.empty(3)
     known = -1
     edit = row_table[restrict, 0] if restrict >= 0 else 0
     whole = True
     for g in range(n_groups):
         whole = whole and (restrict < 0 or groups[edit, g] != 0)
     total[:] = 0.0
-    for k in range(piece[1], piece[2]):
+    # Without offsets and weights of one row's casters, neighbours that the same rows act on differ in their light alone.
+    is_plain = reach == 0 and restrict < 0 and n_groups == 1 and version_restrict[version, 3] == 0
+    k = piece[1]
+    while k < piece[2]:
         cell = cells[k]
         first, end = cell_begin[cell], cell_begin[cell + 1]
         if not all_cells and not _concerned(row_changed, entry_row, first, end):
+            k += 1
             continue
         share = 1.0
         if restrict >= 0:
@@ -200,46 +203,64 @@ def _piece_deltas(  # type: ignore[no-untyped-def]
                 if entry_row[entry] == restrict:
                     share = np.float64(entry_weight[entry])
         if reach != 0:
-            value[:] = share
-        else:
-            # Neighbours on one surface mostly have the same coefficients.
-            if run_of[cell] != known or looks[cell] != 0:
-                known = run_of[cell]
-                total_found[:] = 0.0
-                for s in range(version_sets[version], version_sets[version + 1]):
-                    compose(
-                        sets[s],
-                        first,
-                        end,
-                        entry_row,
-                        entry_weight,
-                        entry_slot,
-                        slots,
-                        row_table,
-                        row_amount,
-                        groups,
-                        b,
-                        cell,
-                        found,
-                    )
-                    for g in range(n_groups):
-                        for c in range(3):
-                            scale = found[g, 0, c] - 1.0 if unedited != 0 else found[g, 0, c]
-                            total_found[g, 0, c] += set_sign[s] * scale
-                            for kind in range(1, 4):
-                                total_found[g, kind, c] += set_sign[s] * found[g, kind, c]
             for c in range(3):
-                light = total_found[0, 1, c] if whole else 0.0
+                deltas[k, c] = share
+            k += 1
+            continue
+        if run_of[cell] != known or looks[cell] != 0:
+            known = run_of[cell]
+            total_found[:] = 0.0
+            for s in range(version_sets[version], version_sets[version + 1]):
+                compose(
+                    sets[s],
+                    first,
+                    end,
+                    entry_row,
+                    entry_weight,
+                    entry_slot,
+                    slots,
+                    row_table,
+                    row_amount,
+                    groups,
+                    b,
+                    cell,
+                    found,
+                )
                 for g in range(n_groups):
-                    if restrict >= 0 and groups[edit, g] == 0:
-                        continue
-                    light += total_found[g, 0, c] * b[g, cell, c]
-                    radiance = share * area[cell] * b[g, cell, c]
-                    total[c] += total_found[g, 2, c] * radiance
-                    total[3 + c] += total_found[g, 3, c] * radiance
-                value[c] = share * light
+                    for c in range(3):
+                        scale = found[g, 0, c] - 1.0 if unedited != 0 else found[g, 0, c]
+                        total_found[g, 0, c] += set_sign[s] * scale
+                        for kind in range(1, 4):
+                            total_found[g, kind, c] += set_sign[s] * found[g, kind, c]
+        if is_plain and looks[cell] == 0:
+            k = _scale_run(k, piece[2], cells, run_of, b[0], total_found[0], deltas)
+            continue
         for c in range(3):
-            deltas[k, c] = value[c]
+            light = total_found[0, 1, c] if whole else 0.0
+            for g in range(n_groups):
+                if restrict >= 0 and groups[edit, g] == 0:
+                    continue
+                light += total_found[g, 0, c] * b[g, cell, c]
+                radiance = share * area[cell] * b[g, cell, c]
+                total[c] += total_found[g, 2, c] * radiance
+                total[3 + c] += total_found[g, 3, c] * radiance
+            deltas[k, c] = share * light
+        k += 1
+
+
+@kernel
+def _scale_run(k, end, cells, run_of, b, found, deltas):  # type: ignore[no-untyped-def]
+    """Differences at the cells from `k` on that belong to one run, and where it ends."""
+    r0, r1, r2 = found[0, 0], found[0, 1], found[0, 2]
+    e0, e1, e2 = found[1, 0], found[1, 1], found[1, 2]
+    run = run_of[cells[k]]
+    while k < end and run_of[cells[k]] == run:
+        cell = cells[k]
+        deltas[k, 0] = e0 + r0 * b[cell, 0]
+        deltas[k, 1] = e1 + r1 * b[cell, 1]
+        deltas[k, 2] = e2 + r2 * b[cell, 2]
+        k += 1
+    return k
 
 
 @kernel
@@ -523,24 +544,22 @@ def sum_products(tile, group, term_begin, term_version, pair_of, values, n_tiles
     for job in prange(n * len(sums)):
         lobe, k = job // n, job % n
         _sum_terms(
-            sums[lobe, tile[k]],
+            sums[lobe, tile[k]].reshape(-1),
             term_version[term_begin[group[k]] : term_begin[group[k] + 1]],
-            pair_of[:, tile[k]],
+            pair_of,
+            tile[k],
             values[lobe],
-            sums[lobe, n_tiles + k],
+            sums[lobe, n_tiles + k].reshape(-1),
         )
 
 
 @kernel
-def _sum_terms(unedited, versions, pair_of, values, out):  # type: ignore[no-untyped-def]
-    for lane in range(64):
-        for c in range(3):
-            out[lane, c] = unedited[lane, c]
+def _sum_terms(unedited, versions, pair_of, tile, values, out):  # type: ignore[no-untyped-def]
+    out[:] = unedited
     for version in versions:
-        pair = pair_of[version]
-        for lane in range(64):
-            for c in range(3):
-                out[lane, c] += values[pair, lane, c]
+        value = values[pair_of[version, tile]].reshape(-1)
+        for i in range(len(out)):
+            out[i] += value[i]
 
 
 @parallel_kernel
