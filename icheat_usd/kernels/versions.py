@@ -187,7 +187,7 @@ def _piece_deltas(  # type: ignore[no-untyped-def]
     for g in range(n_groups):
         whole = whole and (restrict < 0 or groups[edit, g] != 0)
     total[:] = 0.0
-    # Without offsets and weights of one row's casters, neighbours that the same rows act on differ in their light alone.
+    # Without offsets and weights of one row's casters, neighbours under the same rows differ in their light alone.
     is_plain = reach == 0 and restrict < 0 and n_groups == 1 and version_restrict[version, 3] == 0
     k = piece[1]
     while k < piece[2]:
