@@ -11,6 +11,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, is_dataclass, replace
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar, cast
 from weakref import WeakValueDictionary
 
@@ -155,7 +156,7 @@ def array_bytes(things: Iterable[Any]) -> int:
         seen.add(id(thing))
         if isinstance(thing, (tuple, list, set, frozenset)):
             pending.extend(thing)
-        elif isinstance(thing, dict):
+        elif isinstance(thing, (dict, MappingProxyType)):
             pending.extend(thing.values())
         elif type(thing).__module__.startswith("icheat_usd."):
             if is_dataclass(thing):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -51,7 +52,8 @@ def test_shared_arrays_count_once() -> None:
         assert found.put(frame, [shared, shared[:10], np.zeros(100, np.uint8)], 1.0) == ()
     assert found.bytes() == 1024 + 5 * 100
     assert found.bytes_of(3) == (1124, 100)
-    assert array_bytes([{"a": (shared, [shared])}, None, 3]) == 1024
+    assert array_bytes([{"a": (shared, [shared])}, MappingProxyType({"b": shared[:8]}), None, 3]) == 1024
+    assert array_bytes([MappingProxyType({"b": shared})]) == 1024
 
 
 def test_parts_live_as_long_as_something_uses_them() -> None:
