@@ -14,13 +14,14 @@ from icheat_usd.errors import IcheatError
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.progress import silent
-from icheat_usd.scene import SceneSnapshot
+from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.session import authoring
 from icheat_usd.session.background import Background, Job, Stopped
 from icheat_usd.session.content_keys import digest
 from icheat_usd.session.dabs import TexelPlaces
 from icheat_usd.session.document import Session
 from icheat_usd.session.evaluator import Evaluator
+from icheat_usd.session.first_look import surfaces_by_headlight
 from icheat_usd.session.frames import ResidentFrames, SharedParts, share_tables
 from icheat_usd.session.live_state import UNCHANGED, LiveState
 from icheat_usd.session.quality import coarse
@@ -49,12 +50,13 @@ _ORDER = {level: i for i, level in enumerate(Level)}
 class LiveEvent:
     """What listeners hear; from the background thread, so hand it on to the window's own."""
 
-    kind: str  #: "progress", "better" (show the frame again) or "error"
+    kind: str  #: "surfaces" (an `image` until there is light), "progress", "better" (show the frame again) or "error"
     frame: float | None
     level: Level
     step: str = ""
     fraction: float = 0.0
     error: Exception | None = None
+    image: F32 | None = None  #: (height, width, 3) scene-linear
 
 
 Listener = Callable[[LiveEvent], None]
@@ -295,6 +297,9 @@ class LiveFrames:
         key = digest(_keys_of_image(parts), parts.snapshot.centre)
         evaluator = self._shared.find("evaluator", key)
         if evaluator is None:
+            if frame.evaluator is None:
+                look = surfaces_by_headlight(parts.view)
+                self._tell(LiveEvent("surfaces", number, frame.level, image=look))
             for transport in parts.transports():
                 if evaluator is None:
                     evaluator = self._evaluator(parts, transport, level)

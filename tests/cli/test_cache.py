@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.cli import main
+from icheat_usd.kernels._jit import cache_directory
 from icheat_usd.resources import resource_path
 from icheat_usd.session import Quality, Session, shot_parts
 from icheat_usd.session.disk_cache import DiskCache
@@ -29,6 +30,9 @@ def test_a_preview_finds_what_another_one_kept_and_damage_costs_time_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(shot_parts, "WORTH_KEEPING_SECONDS", 0.0)
+    # Compiled kernels stay where they are: it is not they that are looked for here.
+    cache_directory().mkdir(parents=True, exist_ok=True)
+    (tmp_path / "kernels").symlink_to(cache_directory())
     monkeypatch.setenv("ICHEAT_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("ICHEAT_CACHE_SIZE", "1G")
     cache = DiskCache()

@@ -10,7 +10,7 @@ from icheat_usd.resources import resource_path
 
 #: Says which modules have compiled kernels when the first picture is there; the background is held until then.
 CHILD = """
-import json, sys, threading
+import json, os, sys, threading
 from dataclasses import replace
 from icheat_usd.session import LiveSession
 from icheat_usd.session.quality import LIVE
@@ -26,8 +26,8 @@ with LiveSession.open(sys.argv[1], width=24, height=18, quality=quality) as live
         for kernel, function in vars(module).items()
         if getattr(function, "signatures", None) and function.py_func.__module__ == name
     ]
-    print(json.dumps(used))
-    seen.set()
+    print(json.dumps(used), flush=True)
+    os._exit(0)  # what would come next is compiled, where it has to be, for those who need it
 """
 
 #: Placing records, packing, their products and what is left at rest come later, in the background.

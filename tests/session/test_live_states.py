@@ -14,6 +14,7 @@ from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.session import Quality, Session, shot_parts
 from icheat_usd.session.live import LiveSession
+from icheat_usd.session.live_frames import LiveEvent
 from icheat_usd.session.live_state import UNCHANGED
 from tests.session.test_session import ROOM
 
@@ -156,6 +157,20 @@ def test_frames_that_share_rows_need_no_coarse_ones(stage: Path, monkeypatch: py
     assert made == [8, 1]
     assert (1.0, "preview") in heard and (2.0, "preview") not in heard[heard.index((2.0, "full")) :]
     np.testing.assert_allclose(second, first / 2, rtol=1e-3, atol=1e-5)
+
+
+def test_surfaces_are_shown_before_there_is_light(stage: Path) -> None:
+    heard: list[LiveEvent] = []
+    with open_live(stage) as live:
+        live.listen(heard.append)
+        live.frame()
+    kinds = [event.kind for event in heard if event.kind != "progress"]
+    assert kinds[0] == "surfaces" and kinds.count("surfaces") == 1
+    image = next(event.image for event in heard if event.kind == "surfaces")
+    assert image is not None and image.shape == (15, 20, 3) and image.dtype == np.float32
+    assert 0 < image.min() and image.max() < 1
+    redness = image[..., 0] / image[..., 2]
+    assert redness.min() == pytest.approx(1) and redness.max() == pytest.approx(8), "a red block in a grey room"
 
 
 def test_listeners_hear_which_kernels_are_compiled() -> None:
