@@ -15,7 +15,7 @@ from icheat_usd.tracing import Tracer
 from icheat_usd.transport import Lobe, SparseRows, Transport
 from icheat_usd.transport.rays import RowBuilder
 
-_ROWS_AT_ONCE = 512  # bounds memory: a row of 16,384 rays holds up to as many entries
+_RAYS_AT_ONCE = 512 * 16_384  # bounds memory: a row holds up to as many entries as rays
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,9 @@ def converged_products(
     (n_lights, view.n, 3) float32
     """
     out = np.empty((len(radiance), view.n, 3), np.float32)
-    for first in range(0, view.n, _ROWS_AT_ONCE):
-        part = np.arange(first, min(first + _ROWS_AT_ONCE, view.n))
+    at_once = max(1, _RAYS_AT_ONCE // n_rays)
+    for first in range(0, view.n, at_once):
+        part = np.arange(first, min(first + at_once, view.n))
         rows = converged_transport(snapshot, tracer, gather, view_of(view, part), n_rays, seed + 7919 * (1 + first))
         for light, b in enumerate(radiance):
             out[light, part] = rows.to_view(b)

@@ -8,7 +8,7 @@ from typing import Any
 
 from tools.benchmarking.errors import ErrorSettings, measure_errors, overview
 from tools.benchmarking.parts import Effort, Parts
-from tools.benchmarking.test_lights import choose_lights, with_lights
+from tools.benchmarking.test_lights import SETS, choose_lights, with_lights
 
 QUICK = ErrorSettings(
     pixels=60,
@@ -18,6 +18,7 @@ QUICK = ErrorSettings(
     edit_pixels=30,
     hit_pixels=8,
     hit_rays=64,
+    sheet_rays=16,
     n_bounces=3,
     tolerances=(0.1, 0.02),
 )
@@ -33,7 +34,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     """Errors of one stage."""
     fine = "quality" in case
     parts = Parts(case["stage"], replace(effort, quality=case["quality"]) if fine else effort)
-    lights = choose_lights(parts.snapshot, parts.tracer, parts.view)
+    lights = choose_lights(parts.snapshot, parts.tracer, parts.view, SETS[case["lights"]])
     under = parts.under(with_lights(parts.snapshot, lights))
     settings = QUICK if quick else ErrorSettings()
     if fine:  # what does not depend on the mode is measured once
@@ -47,6 +48,11 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
 def markdown(results: list[dict[str, Any]]) -> list[str]:
     """Tables for README, one pair per quality."""
     lines: list[str] = []
+    for chosen in dict.fromkeys(one["case"]["lights"] for one in results):
+        lines += [
+            f"Root mean square errors over that of the light (± standard error), {chosen} set of test lights.",
+            "",
+        ]
     for quality in dict.fromkeys(one["case"].get("quality", "") for one in results):
         some = [one for one in results if one["case"].get("quality", "") == quality]
         lines += [*([f"Quality {quality}:", ""] if quality else []), *_tables(some), ""]
@@ -75,10 +81,17 @@ def _tables(results: list[dict[str, Any]]) -> list[str]:
             f"| median; worst | {_both(figures, 'interpolation_and_packing')} | {_both(figures, 'total')} |"
             f" {_both(figures, 'while_moving')} | {_both(figures, 'at_rest')} | | |"
         )
-    lines += ["", "| stage, edit | of the unedited light | error of the change |", "| --- | ---: | ---: |"]
+    lines += [
+        "",
+        "| stage, edit | of the unedited light | error of the change | at rest |",
+        "| --- | ---: | ---: | ---: |",
+    ]
     for stage, result in found.items():
         for name, edit in result["edits"].items():
-            lines.append(f"| {stage}, {name} | {100 * edit['of_unedited']:.1f} % | {_percent(edit['change'])} |")
+            lines.append(
+                f"| {stage}, {name} | {100 * edit['of_unedited']:.1f} % | {_percent(edit['change'])} |"
+                f" {_percent(edit['change_at_rest'])} |"
+            )
     return lines
 
 

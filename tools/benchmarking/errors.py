@@ -28,7 +28,7 @@ from tools.benchmarking.converged import (
     records_of,
     view_of,
 )
-from tools.benchmarking.error_images import write_error_image, write_signed_image
+from tools.benchmarking.error_images import write_error_image, write_sheet, write_signed_image
 from tools.benchmarking.made_up_edits import edits_of_objects_and_brushes, one_edit, ranked_paths
 from tools.benchmarking.meter import repeat
 from tools.benchmarking.parts import Parts
@@ -46,6 +46,7 @@ class ErrorSettings:
     edit_pixels: int = 500
     hit_pixels: int = 200  #: for the comparison with light at true hits
     hit_rays: int = 1024
+    sheet_rays: int = 256  #: per pixel of the images to look at
     n_bounces: int = 16
     tolerances: tuple[float, ...] = (
         0.1,
@@ -94,7 +95,7 @@ def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -
     if settings.hit_pixels:
         found["cells_against_true_hits"] = _against_true_hits(parts, references, settings, names)
     if folder is not None:
-        found["images"] = _images(parts, references, names, folder)
+        found["images"] = _images(parts, references, settings, names, folder)
     found["seconds"] = time.perf_counter() - started
     return found
 
@@ -273,10 +274,12 @@ def _of_edits(parts: Parts, references: References, settings: ErrorSettings) -> 
             lit = evaluator.relight(field, gains)
             changes.append(probe.to_pixels(lit.indirect_edited - lit.indirect))
         unedited = [probe.to_pixels(evaluator.transport.to_view(evaluator.radiance(gains))) for evaluator in evaluators]
-        shown = parts.edit_change(EditStack("/edit", (edit,)), gains)[probe.samples]
-        error = relative_error(probe.to_pixels(shown), changes[0], changes[1])
-        share = np.sqrt((changes[0] * changes[1]).mean() / (unedited[0] * unedited[1]).mean())
-        found[name] = {"change": error.as_dict(), "of_unedited": float(share)}
+        errors = {}
+        for kind, at_rest in (("change", False), ("change_at_rest", True)):
+            shown = parts.edit_change(EditStack("/edit", (edit,)), gains, at_rest=at_rest)[probe.samples]
+            errors[kind] = relative_error(probe.to_pixels(shown), changes[0], changes[1]).as_dict()
+        share = np.sqrt(max((changes[0] * changes[1]).mean(), 0.0) / (unedited[0] * unedited[1]).mean())
+        found[name] = errors | {"of_unedited": float(share)}
     return found
 
 
@@ -324,22 +327,27 @@ def one_light_of(parts: Parts, light: int) -> Any:
     return replace(parts.snapshot, lights=alone, light_paths=parts.snapshot.light_paths[kept])
 
 
-def _images(parts: Parts, references: References, names: list[str], folder: Path) -> list[str]:
-    """The error at every probed pixel, and what packing loses at every pixel; 8 % of the light is full colour."""
+def _images(parts: Parts, references: References, settings: ErrorSettings, names: list[str], folder: Path) -> list[str]:
+    """By light: the error at every probed pixel, what packing loses, and reference, preview and difference in full.
+
+    8 % of the light is full colour.
+    """
     written = []
     probe = references.probe
+    b = ((references.b[0] + references.b[1]) / 2).astype(np.float32)
+    seed = settings.seed + 9000
+    whole = converged_products(parts.snapshot, parts.tracer, parts.gather, parts.view, settings.sheet_rays, seed, b)
     for light, name in enumerate(names):
-        b = parts.lights.radiance[light]
-        shown = parts.packed.to_view(b)
+        own = parts.lights.radiance[light]
+        shown = parts.packed.to_view(own)
         reference = (references.own_b[0][light] + references.own_b[1][light]) / 2
         root = float(np.sqrt(max((references.own_b[0][light] * references.own_b[1][light]).mean(), 1e-30)))
         off = (probe.to_pixels(shown[probe.samples]) - reference) / root
         written.append(write_error_image(folder / f"{parts.name}_{name}_total.png", off, probe))
-        lost = (shown - parts.transport.to_view(b)) / root
+        lost = (shown - parts.transport.to_view(own)) / root
         written.append(write_signed_image(folder / f"{parts.name}_{name}_packing.png", lost, parts.view))
-        written.append(
-            write_signed_image(folder / f"{parts.name}_{name}_light.png", shown / root, parts.view, shown=True)
-        )
+        sheet = folder / f"{parts.name}_{name}_sheet.png"
+        written.append(write_sheet(sheet, whole[light] / root, shown / root, parts.view))
     return written
 
 

@@ -15,6 +15,7 @@ from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.session.document import Session
+from icheat_usd.session.frames import SharedParts
 from icheat_usd.session.quality import PREVIEW, Quality
 from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.tracing import Tracer
@@ -34,11 +35,12 @@ class Effort:
     height: int = 480
     n_gather: int | None = None
     quality: str = "LIVE"  #: name of a quality of `icheat_usd.session`
+    changes: tuple[tuple[str, Any], ...] = ()  #: to settings of that quality
 
     def settings(self) -> Quality:
         import icheat_usd.session.quality as qualities
 
-        quality: Quality = getattr(qualities, self.quality, PREVIEW)
+        quality: Quality = replace(getattr(qualities, self.quality, PREVIEW), **dict(self.changes))
         return quality if self.n_gather is None else replace(quality, n_gather=self.n_gather)
 
 
@@ -56,13 +58,15 @@ class Parts:
         self.effort = effort
         self.session = Session.open(stage, width=effort.width, height=effort.height, quality=effort.settings())
         self.snapshot = self.session.snapshot if snapshot is None else snapshot
-        self._shot = ShotParts(effort.settings(), snapshot=self.snapshot)
+        self._memory = SharedParts()
+        self._shot = ShotParts(effort.settings(), snapshot=self.snapshot, memory=self._memory)
 
     def under(self, snapshot: SceneSnapshot) -> Parts:
-        """The same stage with other lights."""
+        """The same stage with other lights; what does not depend on them is shared."""
         other = Parts.__new__(Parts)
         other.name, other.effort, other.session, other.snapshot = self.name, self.effort, self.session, snapshot
-        other._shot = ShotParts(self.effort.settings(), snapshot=snapshot)
+        other._memory = self._memory
+        other._shot = ShotParts(self.effort.settings(), snapshot=snapshot, memory=self._memory)
         return other
 
     @property
@@ -130,13 +134,16 @@ class Parts:
         while self.lights.refine():
             pass
 
-    def edit_change(self, stack: EditStack, gains: F32) -> F32:
-        """What a stack changes of the indirect light of every view sample at once, (n_view, 3)."""
+    def edit_change(self, stack: EditStack, gains: F32, *, at_rest: bool = False) -> F32:
+        """What a stack changes of the indirect light of every view sample, at once or at rest, (n_view, 3)."""
         before = self.lights.gains.copy()
         self._set_gains(gains)
         # One that was at rest before may know more of the lights than a frame does.
         live = LiveRelighter(self.snapshot, self.view, self.gather, self.packed, self.lights)
         live.set_stack(stack)
+        live.relit()
+        while at_rest and live.refine():
+            pass
         lit = live.relit()
         self._set_gains(before)
         return lit.indirect_edited - lit.indirect

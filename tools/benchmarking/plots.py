@@ -10,6 +10,8 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402
 
+from tools.benchmarking.growth import points_of  # noqa: E402
+
 
 def plot(report: dict[str, Any], folder: Path) -> list[Path]:
     """One image per suite that has something to show."""
@@ -44,16 +46,16 @@ def _curve(results: list[dict[str, Any]], path: Path) -> bool:
 
 def _growth(results: list[dict[str, Any]], path: Path) -> bool:
     """Time of a frame and memory over each size, relative to the smallest."""
-    kinds = list(dict.fromkeys(one["case"]["what"] for one in results))
+    points = points_of(results)
+    kinds = list(dict.fromkeys(point["what"] for point in points))
     figure, all_axes = pyplot.subplots(1, len(kinds), figsize=(3 * len(kinds), 3.2), squeeze=False)
     for axes, kind in zip(all_axes[0], kinds, strict=True):
-        some = sorted((one for one in results if one["case"]["what"] == kind), key=lambda one: one["result"]["size"])
-        sizes = [one["result"]["size"] for one in some]
-        for name, values in {
-            "frame": [one["result"]["frame_seconds"] for one in some],
-            "build": [one["result"]["build_seconds"] for one in some],
-            "memory": [one["peak_mib"] for one in some],
-        }.items():
+        some = [point for point in points if point["what"] == kind]
+        sizes = [point["size"] for point in some]
+        for name, key in (("frame", "frame_seconds"), ("build", "transport_seconds"), ("memory", "peak_mib")):
+            values = [point[key] for point in some if key in point]
+            if len(values) < len(sizes):
+                continue
             axes.plot(sizes, [value / values[0] for value in values], "o-", label=name)
         axes.set_title(kind, fontsize=9)
         axes.set_ylim(bottom=0)

@@ -15,6 +15,7 @@ from typing import Any
 
 from tools.benchmarking.meter import PeakMemory, command, machine
 from tools.benchmarking.stage_names import default_stages, short_name
+from tools.benchmarking.test_lights import SETS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,6 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that everything runs")
     parser.add_argument("--output", default="benchmark_output", help="folder for report.json, report.md, plots, images")
     parser.add_argument("--minutes", type=float, default=60.0, help="soak: how long")
+    parser.add_argument(
+        "--lights", choices=sorted(SETS), default="first", help="errors: which test lights; second is for reports alone"
+    )
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--gather", type=int, help="gather samples; default the preview's own")
@@ -71,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         suite = importlib.import_module(f"tools.benchmarking.{SUITES[name]}")
         results = []
         for case in suite.cases(stages, arguments.quick):
-            case = {"name": short_name(case["stage"]), "minutes": arguments.minutes, **case}
+            case = {"name": short_name(case["stage"]), "minutes": arguments.minutes, "lights": arguments.lights, **case}
             print(f"{name}: {_described(case)}", flush=True)
             task = {"suite": name, "case": case, "effort": effort, "quick": arguments.quick}
             results.append(_run_case(task | {"folder": str(folder / "images")}))
@@ -97,7 +101,7 @@ def markdown(report: dict[str, Any]) -> str:
 
 
 def _described(case: dict[str, Any]) -> str:
-    extras = [f"{key} {value}" for key, value in case.items() if key not in ("name", "stage", "minutes")]
+    extras = [f"{key} {value}" for key, value in case.items() if key not in ("name", "stage", "minutes", "lights")]
     return ", ".join([case["name"], *extras])
 
 
