@@ -20,8 +20,13 @@ from icheat_usd.errors import EditError
 from icheat_usd.scene import F32, I64, Bool, Finding, SceneSnapshot
 
 
-def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
+def bind(stack: EditStack, snapshot: SceneSnapshot, known: Mapping[str, BoundEdit] | None = None) -> EditField:
     """Bind the active edits of `stack` to a scene.
+
+    Parameters
+    ----------
+    known : mapping, optional
+        Edits by path that were bound to this scene before: what binding them anew would find is taken from there.
 
     Raises
     ------
@@ -31,12 +36,36 @@ def bind(stack: EditStack, snapshot: SceneSnapshot) -> EditField:
         be placed on the scene.
     """
     group, members = _light_groups(stack, snapshot)
-    bound = [_bind_edit(edit, snapshot, members.get(edit.path)) for edit in stack.active]
+    bound = [
+        _bound_as(known.get(edit.path) if known else None, edit, members.get(edit.path))
+        or _bind_edit(edit, snapshot, members.get(edit.path))
+        for edit in stack.active
+    ]
     n_groups = int(group.max(initial=0)) + 1
     # An edit that is blocked at this time has no key left, and one whose lights are all out nothing to scale.
     edits = tuple(edit for edit in bound if edit.n_keys and (edit.groups.any() or not len(edit.groups)))
     edits = tuple(_with_groups(edit, n_groups) for edit in edits)
     return EditField(edits, group, n_groups, _findings(edits))
+
+
+def _bound_as(known: BoundEdit | None, edit: Edit, groups: Bool | None) -> BoundEdit | None:
+    """An edit that may differ from a bound one in amount, blend and lights; None if it differs in more."""
+    if known is None or not _is_placed_as(known.edit, edit):
+        return None
+    weights = tuple(weight for _, weight in _payloads(edit))
+    return replace(known, edit=edit, key_weights=weights, groups=np.zeros(0, np.bool_) if groups is None else groups)
+
+
+def _is_placed_as(a: Edit, b: Edit) -> bool:
+    """Whether two edits select the same and do the same."""
+    return a is b or (
+        (a.path, a.operation, a.occluders, a.target) == (b.path, b.operation, b.occluders, b.target)
+        and (a.parameters is b.parameters or dict(a.parameters) == dict(b.parameters))
+        and (a.receivers is b.receivers or a.receivers == b.receivers)
+        and (a.casters is b.casters or a.casters == b.casters)
+        and len(a.keys) == len(b.keys)
+        and all(x.payload is y.payload for x, y in zip(a.keys, b.keys, strict=True))
+    )
 
 
 def rebind(bound: BoundEdit, edit: Edit, snapshot: SceneSnapshot) -> BoundEdit:

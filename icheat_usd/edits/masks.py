@@ -11,6 +11,7 @@ from icheat_usd.edits.model import MaskedSurface, SurfaceMask
 from icheat_usd.edits.painting import surface_texel_positions
 from icheat_usd.errors import EditError
 from icheat_usd.kernels import nearest as kernels
+from icheat_usd.kernels.texels import bilinear_texels
 from icheat_usd.scene import F32, F64, I32, I64, Finding, SceneSnapshot, Surface
 
 #: Texel spacings by which a texel that faces the other way is further off (twice over).
@@ -34,10 +35,14 @@ class BoundMask:
         face : (n,) control faces
         face_uv : (n, 2) places in them
         """
-        first = self.first_face[instance]
-        painted = first >= 0
+        first = np.take(self.first_face, instance)
+        if (first >= 0).all():
+            return texel_weights(self.texels, first + face, face_uv)
+        painted = np.flatnonzero(first >= 0)
         weights = np.zeros(len(instance), np.float32)
-        weights[painted] = texel_weights(self.texels, first[painted] + face[painted], face_uv[painted])
+        weights[painted] = texel_weights(
+            self.texels, np.take(first, painted) + np.take(face, painted), np.take(face_uv, painted, axis=0)
+        )
         return weights
 
 
@@ -92,15 +97,9 @@ def _same_topology(masked: MaskedSurface, surface: Surface) -> bool:
 
 def texel_weights(texels: F32, rows: I64, uv: F32) -> F32:
     """Bilinear weights (n,) at places (n, 2) of the faces in some rows of `texels`."""
-    resolution = texels.shape[1]
-    place = np.clip(uv * np.float32(resolution) - np.float32(0.5), 0, resolution - 1)
-    low = np.minimum(place.astype(np.int64), max(resolution - 2, 0))
-    high = np.minimum(low + 1, resolution - 1)
-    f = (place - low).astype(np.float32)
-    x0, y0, x1, y1 = low[:, 0], low[:, 1], high[:, 0], high[:, 1]
-    top = texels[rows, y0, x0] * (1 - f[:, 0]) + texels[rows, y0, x1] * f[:, 0]
-    bottom = texels[rows, y1, x0] * (1 - f[:, 0]) + texels[rows, y1, x1] * f[:, 0]
-    return (top * (1 - f[:, 1]) + bottom * f[:, 1]).astype(np.float32)
+    weights = np.empty(len(rows), np.float32)
+    bilinear_texels(np.ascontiguousarray(texels), rows, np.ascontiguousarray(uv), weights)
+    return weights
 
 
 # --------------------------------------------------------------------------- another topology

@@ -20,7 +20,7 @@ from icheat_usd.edits.model import (
     SurfacesAt,
     SurfacesOf,
 )
-from icheat_usd.scene import F32, I32, Finding, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, Finding, SceneSnapshot, SurfacePoints
 
 #: A surface that lies on the border of a region is inside, whichever way its points were rounded.
 _BORDER = np.float32(1 + 1e-5)
@@ -46,19 +46,27 @@ class BoundSelection:
 
     def at(self, points: SurfacePoints) -> F32:
         """Weights of the points, (n,) in [0, 1]; 0 where a point is no hit."""
-        hit = points.instance >= 0
-        weights = np.zeros(len(hit), np.float32)
-        weights[hit] = self.on_instances[points.instance[hit]]
+        # The weight behind the last instance's is that of no hit, -1.
+        on_instances = np.append(self.on_instances, np.float32(0))
+        weights = np.take(on_instances, points.instance)
+        if not self.constant_on_instances:
+            some = np.flatnonzero(weights)
+            weights[some] = self.at_some(points, some)
+        return weights
+
+    def at_some(self, points: SurfacePoints, some: I64) -> F32:
+        """Weights of some of the points, all of them hits."""
+        instance = np.take(points.instance, some)
+        weights = np.take(self.on_instances, instance)
         if self.constant_on_instances:
             return weights
-        some = np.flatnonzero(weights)
-        places = _Places(points.position[some], points.instance[some], points.triangle[some])
-        inside = weights[some]
-        for limit in self.within:
-            inside = inside * limit.weights(places)
+        if self.within:
+            places = _Places(np.take(points.position, some, axis=0), instance, np.take(points.triangle, some))
+            for limit in self.within:
+                weights = weights * limit.weights(places)
         if self.mask is not None:
-            inside = inside * self.mask.at(places.instance, points.face[some], points.face_uv[some])
-        weights[some] = inside
+            face, face_uv = np.take(points.face, some), np.take(points.face_uv, some, axis=0)
+            weights = weights * self.mask.at(instance, face, face_uv)
         return weights
 
 

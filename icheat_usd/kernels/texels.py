@@ -45,15 +45,39 @@ def texel_positions(face_begin, points, face_uv, resolution, out):  # type: igno
 
 
 @kernel
-def _low_texel(place, resolution):  # type: ignore[no-untyped-def]
+def _texel_place(place, resolution):  # type: ignore[no-untyped-def]
     x = place * np.float32(resolution) - np.float32(0.5)
-    x = min(max(x, np.float32(0)), np.float32(resolution - 1))
-    return min(np.int64(x), max(resolution - 2, 0))
+    return min(max(x, np.float32(0)), np.float32(resolution - 1))
+
+
+@kernel
+def _low_texel(place, resolution):  # type: ignore[no-untyped-def]
+    return min(np.int64(_texel_place(place, resolution)), max(resolution - 2, 0))
+
+
+@kernel
+def _bilinear(texels, uv):  # type: ignore[no-untyped-def]
+    """Weight at one place of a face, (resolution, resolution)."""
+    n = len(texels)
+    x0, y0 = _low_texel(uv[0], n), _low_texel(uv[1], n)
+    x1, y1 = min(x0 + 1, n - 1), min(y0 + 1, n - 1)
+    x, y = _texel_place(uv[0], n) - np.float32(x0), _texel_place(uv[1], n) - np.float32(y0)
+    one = np.float32(1)
+    top = texels[y0, x0] * (one - x) + texels[y0, x1] * x
+    bottom = texels[y1, x0] * (one - x) + texels[y1, x1] * x
+    return top * (one - y) + bottom * y
+
+
+@parallel_kernel
+def bilinear_texels(texels, rows, uv, out):  # type: ignore[no-untyped-def]
+    """Weights (n,) at places `uv` (n, 2) of the faces in some rows of `texels` (n_faces, resolution, resolution)."""
+    for k in prange(len(rows)):
+        out[k] = _bilinear(texels[rows[k]], uv[k])
 
 
 @parallel_kernel
 def touched_places(places, row, uv, changed, out):  # type: ignore[no-untyped-def]
-    """Whether one of the four texels around each place has changed; as `edits.masks.texel_weights` picks them."""
+    """Whether one of the four texels around each place has changed; as `bilinear_texels` picks them."""
     resolution = changed.shape[1]
     for k in prange(len(places)):
         face = row[places[k]]

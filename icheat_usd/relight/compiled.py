@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -107,12 +107,15 @@ class CompiledStack:
         )
 
 
-def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32, at_records: bool = True) -> CompiledStack:
+def compile_stack(
+    field: EditField, gather: GatherSamples, casters: Sequence[tuple[I64, F32]], at_records: bool = True
+) -> CompiledStack:
     """Write a bound stack as tables.
 
     Parameters
     ----------
-    caster_masks : (n_rows, n_gather) of `EditField.casters`
+    casters : for each row
+        Cells, ascending, on surfaces that its casters may lie on, and their weights.
     at_records
         Edits that look at receivers may look at records instead.
     """
@@ -132,14 +135,23 @@ def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32, at
     for row, (_, bound, key) in enumerate(rows):
         if way[row] in (Way.VERSION, Way.AGGREGATE, Way.PAIRS):
             on_instances[row] = bound.casters[key].on_instances[: on_instances.shape[1]] > 0
-    support = on_instances[:, np.maximum(instance, 0)] & (instance >= 0)
-    cells = [np.flatnonzero(there) for there in support]
-    slots, slot_begin, slot = _slots(rows, way, cells, gather)
-    cell = np.concatenate([np.empty(0, np.int64), *cells])
-    row_of = np.repeat(np.arange(len(rows)), [len(there) for there in cells])
-    order = np.argsort(cell, kind="stable")
-    cell, row_of = cell[order], row_of[order]
-    begin = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=gather.n))]).astype(np.int64)
+    acting = np.isin(way, (Way.VERSION, Way.AGGREGATE, Way.PAIRS))
+    cells = [found if acts else found[:0] for (found, _), acts in zip(casters, acting, strict=True)]
+    support = np.zeros((len(rows), gather.n), np.bool_)
+    slots, slot_begin, slot_of = _slots(rows, way, cells, gather)
+    # Entries by cell, those of one cell in the order of rows.
+    count = np.zeros(gather.n, np.int64)
+    for row, there in enumerate(cells):
+        support[row, there] = True
+        count[there] += 1
+    begin = np.concatenate([[0], np.cumsum(count)])
+    following, n = begin[:-1].copy(), int(begin[-1])
+    entry_row, entry_weight, entry_slot = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.int32)
+    for row, there in enumerate(cells):
+        place = np.take(following, there)
+        following[there] = place + 1
+        entry_row[place], entry_slot[place] = row, slot_of[row]
+        entry_weight[place] = casters[row][1][: len(there)]
     edit_of = np.concatenate([table[:, 0], table[aggregates, 0]]).astype(np.int64)
     compiled = CompiledStack(
         field,
@@ -151,9 +163,9 @@ def compile_stack(field: EditField, gather: GatherSamples, caster_masks: F32, at
         np.array([np.float64(bound.edit.amount * bound.key_weights[key]) for _, bound, key in rows], np.float64),
         np.array([bound.groups for bound in field.edits], np.uint8).reshape(len(field.edits), field.n_groups),
         begin,
-        row_of.astype(np.int32),
-        np.ascontiguousarray(caster_masks[row_of, cell], np.float32),
-        slot[order].astype(np.int32),
+        entry_row,
+        entry_weight,
+        entry_slot,
         slots,
         slot_begin,
         support,
@@ -188,17 +200,17 @@ def _gives_offset(bound: BoundEdit, key: int) -> bool:
 
 def _slots(
     rows: list[tuple[int, BoundEdit, int]], way: I64, cells: list[I64], gather: GatherSamples
-) -> tuple[F64, I64, I64]:
-    """Numbers of all rows, where those of each begin, and which each row has at each of its cells, row by row."""
+) -> tuple[F64, I64, list[I64 | int]]:
+    """Numbers of all rows, where those of each begin, and which each row has at its cells: one, or each its own."""
     parts: list[F64] = []
-    slot, begin, n = [np.empty(0, np.int64)], [0], 0
+    slot: list[I64 | int] = []
+    begin = [0]
     for row, (_, bound, key) in enumerate(rows):
         part = numbers_of(bound, key, gather, cells[row]) if way[row] == Way.VERSION else _IDENTITY
-        slot.append(n + (np.arange(len(cells[row])) if len(part) > 1 else np.zeros(len(cells[row]), np.int64)))
+        slot.append(begin[-1] + np.arange(len(cells[row])) if len(part) > 1 else begin[-1])
         parts.append(part)
-        n += len(part)
-        begin.append(n)
-    return np.concatenate([np.zeros((0, 9)), *parts]), np.array(begin, np.int64), np.concatenate(slot)
+        begin.append(begin[-1] + len(part))
+    return np.concatenate([np.zeros((0, 9)), *parts]), np.array(begin, np.int64), slot
 
 
 def numbers_of(bound: BoundEdit, key: int, gather: GatherSamples, cells: I64) -> F64:

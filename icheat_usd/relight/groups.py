@@ -10,7 +10,7 @@ caster is touched by all of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.kernels.versions import COMPOSE
 from icheat_usd.relight.compiled import CompiledStack, Way
-from icheat_usd.relight.versions import VersionKey
+from icheat_usd.relight.version_lists import VersionKey
 from icheat_usd.scene import F32, I32, I64
 
 #: More terms than this, and the samples of a group are evaluated pair by pair.
@@ -150,13 +150,50 @@ def _terms(compiled: CompiledStack, hard: tuple[int, ...], members: Sequence[int
 
 
 class SampleGroups:
-    """Which group each view sample belongs to; groups are numbered as they appear."""
+    """Which group each view sample belongs to; groups are numbered as they appear, and never change.
 
-    def __init__(self, compiled: CompiledStack, n_view: int, divided: bool = False) -> None:
-        self._compiled, self.divided = compiled, divided
+    Parameters
+    ----------
+    mask_rows : (n_rows,)
+        Where in the receiver masks that of each row is.
+    """
+
+    def __init__(self, compiled: CompiledStack, mask_rows: I64, n_view: int, divided: bool = False) -> None:
+        self.divided = divided
         self._number: dict[bytes, int] = {}
+        self._members: dict[bytes, frozenset[int]] = {}  # rows of the masks that touch each group that can grow
         self.of_sample: I32 = np.full(n_view, -1, np.int32)  #: -1: no edit touches it
         self.terms: list[GroupTerms] = []
+        self.undivided: list[GroupTerms] = []  #: the same as if they were not divided; empty if they are not
+        self._take(compiled, mask_rows)
+
+    def _take(self, compiled: CompiledStack, mask_rows: I64) -> None:
+        self._compiled = compiled
+        self._row_of = dict(zip(mask_rows.tolist(), range(len(mask_rows)), strict=True))
+
+    def restructured(self, compiled: CompiledStack, mask_rows: I64, before: I64, gone: Iterable[int]) -> I64:
+        """Go on with another stack; samples, ascending, whose rows have changed their order and need `assign`.
+
+        Parameters
+        ----------
+        before : (n_rows,) row that each row was, -1 for new ones
+        gone
+            Rows of the masks that now belong to another row, or none; `assign` the samples that they touched, too.
+        """
+        was, lost = self._row_of, frozenset(gone)
+        self._take(compiled, mask_rows)
+        stays = before[before >= 0]
+        is_reordered = bool((np.diff(stays) < 0).any())
+        regrouped = np.zeros(len(self.terms) + 1, np.bool_)
+        for key, members in list(self._members.items()):
+            if members & lost:
+                del self._number[key], self._members[key]
+            elif is_reordered:
+                rows = [was[member] for member in sorted(members, key=self._row_of.__getitem__)]
+                if rows != sorted(rows):
+                    regrouped[self._number[key]] = True
+                    del self._number[key], self._members[key]
+        return np.flatnonzero(regrouped[self.of_sample]) if regrouped.any() else np.empty(0, np.int64)
 
     def assign(self, samples: I64, masks: F32) -> int:
         """Find the groups of some samples by their receiver masks; returns how many groups are new."""
@@ -176,9 +213,33 @@ class SampleGroups:
             return -1
         name = key.tobytes()
         if name not in self._number:
-            n_rows = self._compiled.n_rows
             bits = np.unpackbits(key.view(np.uint8), bitorder="little")
-            whole, soft = (np.flatnonzero(bits[side : side + n_rows]).tolist() for side in (0, 64 * words))
+            sides = [np.flatnonzero(bits[side : side + 64 * words]).tolist() for side in (0, 64 * words)]
+            whole, soft = (sorted(self._row_of[member] for member in side) for side in sides)
+            self._members[name] = frozenset(sides[0] + sides[1])
             self._number[name] = len(self.terms)
             self.terms.append(group_terms(self._compiled, whole, soft, self.divided))
+            if self.divided:
+                self.undivided.append(group_terms(self._compiled, whole, soft))
         return self._number[name]
+
+    def live(self) -> I64:
+        """Groups that some sample belongs to, ascending."""
+        return np.flatnonzero(np.bincount(self.of_sample + 1, minlength=len(self.terms) + 1)[1:])
+
+
+def versions_of(terms: Iterable[GroupTerms]) -> set[VersionKey]:
+    """Versions that the light of some groups is made of."""
+    found: set[VersionKey] = set()
+    for group in terms:
+        found.update(term.version for term in group.light)
+        for row, seen in group.seen:
+            found.update(term.version for term in seen)
+            if seen:
+                found.add(reach_of(row))
+    return found
+
+
+def reach_of(row: int) -> VersionKey:
+    """The weights of the casters of an aggregate's row."""
+    return VersionKey((), (), row, True)

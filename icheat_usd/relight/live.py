@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
@@ -19,7 +20,7 @@ from icheat_usd.kernels.film_table import FilmTable, film_table
 from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.direct_sum import DirectSum
-from icheat_usd.relight.groups import SampleGroups, TermTable
+from icheat_usd.relight.groups import SampleGroups, TermTable, versions_of
 from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
 from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.pair_products import PairProducts
@@ -35,6 +36,8 @@ from icheat_usd.transport.packed import PackedTransport
 
 #: More versions than this, and edits that have no casters in common are kept apart: a version takes a megabyte.
 MOST_VERSIONS = 192
+#: As many groups and versions that nothing needs any more are kept, since forgetting them takes longer than a frame.
+SPARE_GROUPS, SPARE_VERSIONS = 1024, 32
 
 
 class Lights(Protocol):
@@ -86,6 +89,7 @@ class LiveRelighter:
         self._lights_seen: Any = None
         self._moves_seen: Any = None
         self._light_stale = True
+        self._changed_rows: set[int] = set()
         self._stack = LiveStack(snapshot, view, gather, True)
         self._history: History | None = None
         self.set_transport(transport)
@@ -292,31 +296,60 @@ class LiveRelighter:
                 self._regroup()
                 raise
             return
-        self._versions.stack_changed(self._stack.compiled, change.rows, change.painted)
-        self._changed_rows.update(change.rows)
-        if len(change.samples):
-            self._changed_samples.append(change.samples)
+        if change.before is not None and self._groups.divided:
+            # Perhaps they need not be any more.
+            self._regroup()
+            return
+        samples = change.samples
+        if change.before is None:
+            self._versions.stack_changed(self._stack.compiled, change.rows, change.painted)
+            self._changed_rows.update(change.rows)
+        else:
+            samples = self._restructure(change, change.before)
+        if len(samples):
+            self._changed_samples.append(samples)
             self._samples_of.clear()
-            self._place(change.samples)
+            self._place(samples)
+
+    def _restructure(self, change: Change, before: I64) -> I64:
+        """Go on with a stack of other rows; samples, ascending, whose groups are to be found anew."""
+        stack = self._stack
+        samples = self._groups.restructured(stack.compiled, stack.mask_rows, before, change.gone)
+        self._versions.restructured(stack.compiled, before, change.n_before)
+        self._terms.restructured(stack)
+        self._changed_rows = {row for row, was in enumerate(before.tolist()) if was in self._changed_rows}
+        self._samples_of.clear()
+        return np.union1d(samples, change.samples) if len(samples) else change.samples
 
     def _regroup(self, divided: bool = False) -> None:
-        """Find anew which samples share what; `divided` as in `relight.groups.group_terms`."""
+        """Find everything anew; `divided` as in `relight.groups.group_terms`."""
         stack = self._stack
         if self._pair_products is None:
             self._refuse_pairs()
         else:
             self._pair_products.forget()
-        self._groups = SampleGroups(stack.compiled, self.view.n, divided)
         self._versions = Versions(stack.compiled, self._products, self._pair_products, self.gather.area)
-        self._terms = TermTables(stack.compiled, self._groups, self._versions)
-        self._shared = SharedLight(self._products, self._table)
-        self._changed_rows: set[int] = set()
-        self._changed_samples: list[I64] = []
-        self._samples_of: dict[frozenset[int], I64] = {}
+        self._changed_rows = set()
         self._light_stale = True
         if self._narrow is not None:
             self._narrow.versions_changed()
-        self._place(np.flatnonzero((stack.receiver_masks != 0).any(axis=0)))
+        self._group(divided)
+
+    def _group(self, divided: bool) -> None:
+        """Find anew which samples share what, of the versions that there are."""
+        stack = self._stack
+        self._groups = SampleGroups(stack.compiled, stack.mask_rows, self.view.n, divided)
+        self._terms = TermTables(stack, self._groups, self._versions)
+        self._shared = SharedLight(self._products, self._table)
+        self._changed_samples: list[I64] = []
+        self._samples_of: dict[frozenset[int], I64] = {}
+        self._mixed: Bool = np.zeros(self.view.n, np.bool_)
+        self._alone: Bool = np.zeros(self.view.n, np.bool_)
+        self._touched: Bool = np.zeros(self.view.n, np.bool_)
+        self._most_groups = self._most_versions = sys.maxsize
+        self._place(np.flatnonzero(self._touched_by(range(len(stack.mask_rows)))))
+        self._most_groups = 2 * len(self._groups.terms) + SPARE_GROUPS
+        self._most_versions = max(MOST_VERSIONS, self._versions.n + SPARE_VERSIONS)
 
     def _refuse_pairs(self) -> None:
         """Raise an error if the stack needs exact rows."""
@@ -330,8 +363,11 @@ class LiveRelighter:
         groups, products = self._groups, self._products
         groups.assign(samples, self._stack.receiver_masks)
         self._terms.arrange()
-        if self._versions.n > MOST_VERSIONS and not groups.divided:
-            self._regroup(divided=True)
+        if self._is_to_be_divided() != groups.divided:
+            self._regroup(divided=not groups.divided)
+            return
+        if len(groups.terms) > self._most_groups or self._versions.n > self._most_versions:
+            self._collect()
             return
         spread = products.interpolation
         needed = np.zeros((self._versions.n, products.n_tiles), np.uint8)
@@ -349,27 +385,40 @@ class LiveRelighter:
             )
         self._versions.need(needed)
         self._shared.place(samples, groups, np.append(self._terms.shared, False))
-        self._mixed: Bool = ~np.append(self._terms.shared, True)[groups.of_sample]
-        self._alone: Bool = np.append(self._terms.alone, False)[groups.of_sample]
-        samples = np.flatnonzero(self._alone)
-        self._alone_samples: AloneSamples | None = None
-        self._alone_difference: F32 = np.zeros((self.view.n if len(samples) else 0, 3), np.float32)
-        if len(samples):
-            stack = self._stack
-            self._alone_samples = AloneSamples(stack.field, samples, self.view, self.transport, self.held_back)
-        self._find_touched()
-
-    def _find_touched(self) -> None:
-        """Which samples edits touch; the others keep their unedited light, bit for bit."""
-        self._touched = self._touched_by(range(len(self._stack.receiver_masks)))
+        group = groups.of_sample[samples]
+        self._touched[samples] = group >= 0
+        self._mixed[samples] = ~np.append(self._terms.shared, True)[group]
+        self._alone[samples] = np.append(self._terms.alone, False)[group]
         self._mixed_samples = np.flatnonzero(self._mixed)
-        touched = self._touched if self._touched.any() else self._touched[:0]
-        self._own_light = OwnLight(self._mixed_samples.astype(np.int32), self._own, touched)
+        # The others keep their unedited light, bit for bit.
+        held = self._touched if self._touched.any() else self._touched[:0]
+        self._own_light = OwnLight(self._mixed_samples.astype(np.int32), self._own, held)
+        alone = np.flatnonzero(self._alone)
+        self._alone_samples: AloneSamples | None = None
+        self._alone_difference: F32 = np.zeros((self.view.n if len(alone) else 0, 3), np.float32)
+        if len(alone):
+            stack = self._stack
+            self._alone_samples = AloneSamples(stack.field, alone, self.view, self.transport, self.held_back)
+
+    def _is_to_be_divided(self) -> bool:
+        """Whether the groups need too many versions; depends on what the samples belong to alone."""
+        groups = self._groups
+        if groups.divided:
+            return len(versions_of(groups.undivided[group] for group in groups.live())) > MOST_VERSIONS
+        return self._versions.n > MOST_VERSIONS and len(self._terms.versions(groups.live())) > MOST_VERSIONS
+
+    def _collect(self) -> None:
+        """Forget groups that no sample belongs to any more, and versions that none of the others needs."""
+        changed, shared = self._changed_samples, self._shared
+        self._versions.keep(self._terms.versions(self._groups.live()))
+        self._group(self._groups.divided)
+        self._shared.take_unedited(shared)
+        self._changed_samples = changed
 
     def _touched_by(self, rows: Iterable[int]) -> Bool:
         found = np.zeros(self.view.n, np.bool_)
         for row in rows:
-            found |= self._stack.receiver_masks[row] != 0
+            found |= self._stack.receiver_mask(row) != 0
         return found
 
     def _changed_places(self) -> I64:
@@ -480,7 +529,7 @@ class LiveRelighter:
         own = np.zeros((len(samples), 2 * len(terms.aggregates), 3), np.float32)
         for k, row in enumerate(terms.aggregates):
             aggregate = next(found for found in stack.field.aggregates if found.row == row)
-            weight = np.float32(stack.compiled.row_amount[row]) * stack.receiver_masks[row, samples]
+            weight = np.float32(stack.compiled.row_amount[row]) * stack.receiver_mask(row)[samples]
             some = np.flatnonzero((weight != 0) & ~self._alone[samples])
             if not len(some):
                 continue
@@ -497,9 +546,9 @@ class LiveRelighter:
     def _view_ends(self, samples: I64) -> Ends:
         """Receiver masks of what acts on views, which is all that `EditField.finish` looks at."""
         stack = self._stack
-        masks = np.zeros((len(stack.receiver_masks), len(samples)), np.float32)
+        masks = np.zeros((len(stack.mask_rows), len(samples)), np.float32)
         for row in np.flatnonzero(stack.compiled.way == Way.VIEW):
-            masks[row] = stack.receiver_masks[row, samples]
+            masks[row] = stack.receiver_mask(row)[samples]
         return Ends(masks, None, ())
 
 

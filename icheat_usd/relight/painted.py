@@ -1,4 +1,4 @@
-"""Where on a painted mask points lie, so that a dab finds the points that it touches."""
+"""Points by where they lie, so that a selection costs the points on its surfaces and a dab those that it touches."""
 
 from __future__ import annotations
 
@@ -9,7 +9,26 @@ import numpy as np
 from icheat_usd.edits.masks import texel_weights
 from icheat_usd.edits.selection import BoundSelection
 from icheat_usd.kernels.texels import touched_places
-from icheat_usd.scene import F32, I64, Bool, SurfacePoints
+from icheat_usd.scene import F32, I64, SurfacePoints
+
+
+class PointsByInstance:
+    """The points of one sample set, sorted by the instance that they lie on."""
+
+    def __init__(self, points: SurfacePoints) -> None:
+        self.points = points
+        self._order = np.argsort(points.instance, kind="stable").astype(np.int64)
+        n_instances = int(points.instance.max(initial=-1)) + 1
+        self._begin = np.searchsorted(points.instance[self._order], np.arange(n_instances + 1))
+
+    def on(self, on_instances: F32) -> I64:
+        """Points, ascending, on instances whose weight (n_instances,) is not 0."""
+        some = np.flatnonzero(on_instances[: len(self._begin) - 1])
+        parts = [self._order[self._begin[i] : self._begin[i + 1]] for i in some]
+        parts = [part for part in parts if len(part)]
+        if len(parts) < 2:
+            return parts[0] if parts else np.empty(0, np.int64)
+        return np.sort(np.concatenate(parts))
 
 
 class PaintedPoints:
@@ -29,18 +48,21 @@ class PaintedPoints:
         self._uv = np.ascontiguousarray(points.face_uv[self._points])
         self._begin = np.searchsorted(self._row, np.arange(len(selection.mask.texels) + 1)).astype(np.int64)
 
-    def touched(self, changed: Bool) -> I64:
-        """Places in the sorted points whose weight depends on `changed` texels (n_faces, resolution, resolution)."""
+    def repainted(self, before: F32, now: F32) -> tuple[I64, F32]:
+        """Points, ascending, whose weight depends on texels that differ, and their weights now.
+
+        Parameters
+        ----------
+        before, now : (n_faces, resolution, resolution)
+        """
+        changed = before != now
         faces = np.flatnonzero(changed.any(axis=(1, 2)))
         parts = [np.arange(self._begin[face], self._begin[face + 1]) for face in faces]
         places = np.concatenate([np.empty(0, np.int64), *parts])
-        found = np.zeros(len(places), np.bool_)
-        touched_places(places, self._row, self._uv, changed, found)
-        return places[found]
-
-    def weights(self, places: I64, texels: F32) -> tuple[I64, F32]:
-        """The points at some of the places and their weights under the mask; ascending points."""
-        points = self._points[places]
-        weights = self._unpainted[points] * texel_weights(texels, self._row[places], self._uv[places])
+        touched = np.zeros(len(places), np.bool_)
+        touched_places(places, self._row, self._uv, changed, touched)
+        places = places[touched]
+        points = np.take(self._points, places)
+        weights = self._unpainted[points] * texel_weights(now, np.take(self._row, places), self._uv[places])
         order = np.argsort(points, kind="stable")
         return points[order], weights[order]

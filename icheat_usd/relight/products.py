@@ -114,9 +114,17 @@ class Products:
         """Forget the narrowed rows."""
         self._narrow = None
 
-    def clear(self) -> None:
-        """Forget all versions."""
-        self._versions[:] = 0
+    def clear(self, version: int | None = None) -> None:
+        """Forget one version, or all."""
+        self._versions[slice(None) if version is None else version] = 0
+
+    def keep(self, versions: I64) -> None:
+        """Forget all but some versions (ascending), and number these anew, in their order."""
+        n = len(versions)
+        for values in (self._versions, self._sizes, self._is_small):
+            for new, old in enumerate(versions):
+                values[new] = values[old]
+        self._versions[n:] = 0
 
     def reserve(self, n_versions: int) -> None:
         """Have place for so many versions."""

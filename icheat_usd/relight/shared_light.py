@@ -99,6 +99,11 @@ class SharedLight:
         sums[:, : self._sums.shape[1]] = self._sums
         self._sums = sums
 
+    def take_unedited(self, other: SharedLight) -> None:
+        """Go on with the unedited products of another one."""
+        n_tiles = self._products.n_tiles
+        self._sums[:, :n_tiles] = other._sums[:, :n_tiles]
+
     def set_unedited(self, b: F32) -> None:
         """Multiply the transport with the unedited light (n_gather, 3)."""
         self._products.multiply_all(b, self._sums)

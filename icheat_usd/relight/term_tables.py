@@ -7,42 +7,58 @@ from collections.abc import Sequence
 import numpy as np
 
 from icheat_usd.kernels import versions as kernels
-from icheat_usd.relight.compiled import CompiledStack, Way
-from icheat_usd.relight.groups import GroupTerms, SampleGroups, Term, TermTable
+from icheat_usd.relight.compiled import Way
+from icheat_usd.relight.groups import GroupTerms, SampleGroups, Term, TermTable, reach_of
+from icheat_usd.relight.live_stack import LiveStack
 from icheat_usd.relight.products import Products
-from icheat_usd.relight.versions import VersionKey, Versions
+from icheat_usd.relight.versions import Versions
 from icheat_usd.scene import F32, I64, Bool
 
 
 class TermTables:
     """Steps are: for each aggregate the light that it sees and its reach, and the light at the end."""
 
-    def __init__(self, compiled: CompiledStack, groups: SampleGroups, versions: Versions) -> None:
-        self._compiled, self._groups, self._versions = compiled, groups, versions
+    def __init__(self, stack: LiveStack, groups: SampleGroups, versions: Versions) -> None:
+        self._groups, self._versions = groups, versions
+        compiled = stack.compiled
         self.aggregates = np.flatnonzero(compiled.way == Way.AGGREGATE)  #: rows of the stack
         self.light = _EMPTY
-        self.seen: list[TermTable] = []  #: by aggregate
-        self.reach: list[TermTable] = []  #: by aggregate
+        self.seen: list[TermTable] = [_EMPTY] * len(self.aggregates)  #: by aggregate
+        self.reach: list[TermTable] = [_EMPTY] * len(self.aggregates)  #: by aggregate
         self.alone: Bool = np.zeros(0, np.bool_)  #: (n_groups,) evaluated pair by pair
         self.shared: Bool = np.zeros(0, np.bool_)  #: (n_groups,) the same for all samples, but for the interpolation
+        self.restructured(stack)
+
+    def restructured(self, stack: LiveStack) -> None:
+        """Go on with another stack; only one without aggregates may have other rows."""
+        self._compiled, self._mask_rows, self._n_masks = stack.compiled, stack.mask_rows, len(stack.receiver_masks)
 
     @property
     def steps(self) -> list[TermTable]:
         return [*self.seen, *self.reach, self.light]
 
     def arrange(self) -> None:
-        """Make the tables for the groups that there are now."""
-        groups = self._groups.terms
-        self.alone = np.array([terms.alone for terms in groups], np.bool_)
-        offsets = self._compiled.field.has_offset
-        self.shared = np.array([not offsets and _is_shared(terms) for terms in groups], np.bool_)
-        self.light = self._table([terms.light for terms in groups])
+        """Make the tables for the groups that are new."""
+        groups = self._groups.terms[len(self.shared) :]
+        if not groups:
+            return
+        self.alone = np.append(self.alone, [terms.alone for terms in groups]).astype(np.bool_)
+        shared = [self._is_shared(terms) for terms in groups]
+        self.shared = np.append(self.shared, shared).astype(np.bool_)
+        self.light = self._more(self.light, [terms.light for terms in groups])
         seen: list[dict[int, tuple[Term, ...]]] = [dict(terms.seen) for terms in groups]
-        self.seen = [self._table([terms.get(int(row), ()) for terms in seen]) for row in self.aggregates]
-        self.reach = []
-        for row in self.aggregates:
-            term = Term(VersionKey((), (), int(row), True), ())
-            self.reach.append(self._table([(term,) if terms.get(int(row)) else () for terms in seen]))
+        for k, row in enumerate(self.aggregates.tolist()):
+            self.seen[k] = self._more(self.seen[k], [terms.get(row, ()) for terms in seen])
+            reach = Term(reach_of(row), ())
+            self.reach[k] = self._more(self.reach[k], [(reach,) if terms.get(row) else () for terms in seen])
+
+    def versions(self, groups: I64) -> set[int]:
+        """Numbers of the versions that some groups need."""
+        found: set[int] = set()
+        for table in self.steps:
+            for group in groups:
+                found.update(table.term_version[table.term_begin[group] : table.term_begin[group + 1]].tolist())
+        return found
 
     def add(
         self, table: TermTable, samples: I64, masks: F32, own: F32, products: Products, albedo: F32, out: F32
@@ -73,28 +89,32 @@ class TermTables:
             out,
         )
 
-    def _table(self, terms: Sequence[tuple[Term, ...]]) -> TermTable:
+    def _more(self, table: TermTable, terms: Sequence[tuple[Term, ...]]) -> TermTable:
+        """A table with more groups at the end."""
         flat = [term for group in terms for term in group]
         factors = [[self._factor(member) for member in term.factors] for term in flat]
+        ends = table.term_begin[-1] + np.cumsum([len(group) for group in terms])
+        factor_ends = table.factor_begin[-1] + np.cumsum([len(some) for some in factors])
         return TermTable(
-            np.concatenate([[0], np.cumsum([len(group) for group in terms])]).astype(np.int64),
-            np.array([self._versions.number(term.version) for term in flat], np.int32),
-            np.concatenate([[0], np.cumsum([len(some) for some in factors])]).astype(np.int64),
-            np.array([member for some in factors for member in some], np.int32),
+            np.append(table.term_begin, ends).astype(np.int64),
+            np.append(table.term_version, [self._versions.number(term.version) for term in flat]).astype(np.int32),
+            np.append(table.factor_begin, factor_ends).astype(np.int64),
+            np.append(table.factor, [member for some in factors for member in some]).astype(np.int32),
         )
+
+    def _is_shared(self, terms: GroupTerms) -> bool:
+        if terms.alone or terms.view or terms.seen or any(term.factors for term in terms.light):
+            return False
+        return not any(self._compiled.gives_offset[list(term.version.whole)].any() for term in terms.light)
 
     def _factor(self, member: int) -> int:
         """Where `add_terms` finds the factor of a member: in the masks, or among what aggregates came to."""
         n_rows = self._compiled.n_rows
         if member >= n_rows:
-            return n_rows + 2 * (member - n_rows) + 1
+            return self._n_masks + 2 * (member - n_rows) + 1
         if self._compiled.way[member] == Way.AGGREGATE:
-            return n_rows + 2 * int(np.searchsorted(self.aggregates, member))
-        return member
+            return self._n_masks + 2 * int(np.searchsorted(self.aggregates, member))
+        return int(self._mask_rows[member])
 
 
-def _is_shared(terms: GroupTerms) -> bool:
-    return not (terms.alone or terms.view or terms.seen or any(term.factors for term in terms.light))
-
-
-_EMPTY = TermTable(np.zeros(2, np.int64), np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32))
+_EMPTY = TermTable(np.zeros(1, np.int64), np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32))

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.edits.model import Edit, EditStack, KeyedPayload, SurfaceMask
+from icheat_usd.edits.model import Blend, Edit, EditStack, KeyedPayload, Payload, SurfaceMask
 from icheat_usd.errors import EditError
 from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.samples.wavelets import haar_forward
@@ -108,25 +108,70 @@ def repainted(mask: SurfaceMask, rng: np.random.Generator) -> SurfaceMask:
     return replace(mask, texels=texels)
 
 
-def act_at_random(shown: LiveRelighter, rng: np.random.Generator, n_steps: int) -> None:
-    """Commands on a stack of four edits, and frames and refinements between them."""
-    paths = [edit.path for edit in shown.stack.edits]
-    # Most of them leave what the next ones build on.
-    commands = ["amount"] * 6 + ["dab"] * 3 + ["mute", "reorder", "undo", "redo", "gain", "commit", "refine"]
+#: Most of them leave what the next ones build on.
+COMMANDS = ["amount"] * 6 + ["dab"] * 3 + ["mute", "reorder", "undo", "redo", "gain", "commit", "refine"]
+#: Nearly all of them change which edits there are, or what these are.
+STRUCTURAL = [
+    *("mute", "mute", "mute", "reorder", "reorder", "swap", "swap", "add", "remove", "mask", "mask", "dab", "dab"),
+    *("dab and mute", "number", "number and mute", "blend", "amount", "undo", "redo", "gain", "commit", "refine"),
+]
+
+
+def with_mask(one: Edit, side: str, mask: SurfaceMask | None) -> Edit:
+    """The edit with a mask on one side, at all keys."""
+    keys = one.keys or (KeyedPayload(Payload(one.operation, one.parameters), 1.0),)
+    changed = tuple(replace(key, payload=replace(key.payload, **{side: mask})) for key in keys)
+    return replace(one, keys=changed)
+
+
+def changed_stack(stack: EditStack, command: str, rng: np.random.Generator) -> EditStack:
+    """A stack that differs in which edits there are, or in what one of them is."""
+    edits = list(stack.edits)
+    k = int(rng.integers(len(edits)))
+    if "mute" in command:
+        edits[k] = replace(edits[k], enabled=not edits[k].enabled)
+    if command == "swap":
+        edits[k - 1], edits[k] = edits[k], edits[k - 1]
+    elif command == "add" and len(edits) < 8:
+        name = f"new{rng.integers(1000)}_{len(edits)}"
+        casters = [["/red"], ["/back", "/red"], ["/green"]][rng.integers(3)]
+        edits.insert(k, edit(name, str(rng.choice(["scale", "hsv", "paint"])), select("/floor"), select(*casters)))
+    elif command == "remove" and len(edits) > 2:
+        del edits[k]
+    elif command == "blend":
+        edits[k] = replace(edits[k], blend=Blend(rng.choice(list(Blend))))
+    if command.startswith("number"):
+        j = int(rng.integers(len(edits)))
+        numbers = {name: v for name, v in edits[j].parameters.items() if isinstance(v, float)}
+        if numbers and not edits[j].keys:
+            name = str(rng.choice(sorted(numbers)))
+            edits[j] = replace(edits[j], parameters={**edits[j].parameters, name: float(rng.uniform(0.5, 1.5))})
+    if command in ("mask", "dab and mute"):
+        side = str(rng.choice(["receiver_mask", "caster_mask"]))
+        path = "/floor" if side == "receiver_mask" else "/red"
+        j = int(rng.integers(len(edits)))
+        edits[j] = with_mask(edits[j], side, None if rng.integers(3) == 0 else soft_mask(path, int(rng.integers(99))))
+    return replace(stack, edits=tuple(edits))
+
+
+def act_at_random(shown: LiveRelighter, rng: np.random.Generator, n_steps: int, commands: list[str] = COMMANDS) -> None:
+    """Commands on a stack of edits, and frames and refinements between them."""
     for step in range(n_steps):
-        path, command = str(rng.choice(paths)), rng.choice(commands)
+        path, command = str(rng.choice([edit.path for edit in shown.stack.edits])), str(rng.choice(commands))
         if command == "amount":
             shown.set_amount(path, float(rng.choice([0.0, 0.3, 0.5, 0.7, 0.9, 1.2])))
         elif command == "mute":
             shown.mute(path, bool(rng.integers(2)))
         elif command == "reorder":
-            shown.reorder([shown.stack.edits[k].path for k in rng.permutation(4)])
+            shown.reorder([shown.stack.edits[k].path for k in rng.permutation(len(shown.stack.edits))])
         elif command == "dab":
-            painted = [edit for edit in shown.stack.edits if edit.keys]
-            side, chosen = str(rng.choice(["receivers", "casters"])), painted[rng.integers(len(painted))]
-            payload = chosen.keys[1].payload
-            mask = payload.receiver_mask if side == "receivers" else payload.caster_mask
-            shown.dab(chosen.path, side, repainted(mask, rng), key=1)
+            side = str(rng.choice(["receivers", "casters"]))
+            name = "receiver_mask" if side == "receivers" else "caster_mask"
+            painted = [edit for edit in shown.stack.edits if edit.keys and getattr(edit.keys[-1].payload, name)]
+            if painted:
+                chosen = painted[rng.integers(len(painted))]
+                mask = getattr(chosen.keys[-1].payload, name)
+                shown.dab(chosen.path, side, repainted(mask, rng), key=len(chosen.keys) - 1)
         elif command in ("undo", "redo"):
             with contextlib.suppress(EditError):
                 getattr(shown, command)()
@@ -136,6 +181,8 @@ def act_at_random(shown: LiveRelighter, rng: np.random.Generator, n_steps: int) 
             shown.commit()
         elif command == "refine":
             shown.refine()
+        else:
+            shown.set_stack(changed_stack(shown.stack, command, rng))
         if step % 3 == 0:
             shown.frame()
 
@@ -179,6 +226,47 @@ def test_the_same_state_has_the_same_bits_whatever_led_to_it(stack):
         np.testing.assert_array_equal(shown.frame(), again.frame())
         for found, expected in zip(shown.relit(), again.relit(), strict=True):
             np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("stack", ["scale and hsv", "overlapping casters"])
+@pytest.mark.parametrize("spare", [0, 1000])
+def test_stacks_of_other_edits_have_the_bits_of_fresh_ones(stack, spare, monkeypatch):
+    """Edits come, go, swap places and get masks, also while what is needed no more is forgotten at once."""
+    monkeypatch.setattr("icheat_usd.relight.live.SPARE_GROUPS", spare - 10**6 * (spare == 0))
+    monkeypatch.setattr("icheat_usd.relight.live.SPARE_VERSIONS", spare)
+    monkeypatch.setattr("icheat_usd.relight.live.MOST_VERSIONS", 4 if spare == 0 else 192)
+    of = pipeline("full")
+    shown = fresh(of, STACKS[stack], np.ones((2, 3), np.float32))
+    shown.commit()
+    rng = np.random.default_rng(len(stack) + spare)
+    for _ in range(20):
+        act_at_random(shown, rng, 2, STRUCTURAL)
+        again = fresh(of, shown.stack, shown.lights.gains)
+        np.testing.assert_array_equal(shown.frame(), again.frame())
+        for found, expected in zip(shown.relit(), again.relit(), strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_a_stroke_is_found_where_it_is_painted_alone(monkeypatch):
+    """Masks that another command set, on other surfaces or with other places at rest, are dabs too."""
+    of = pipeline("full")
+    stack = EditStack("/stack", (soft("a", "scale", "/floor", "/red", 3), edit("b", "scale")))
+    shown = fresh(of, stack, np.ones((2, 3), np.float32))
+    shown.frame()
+    monkeypatch.setattr(shown, "_regroup", None)
+    rng = np.random.default_rng(5)
+    before, seen, support = shown.stack, shown.frame(), shown._stack.compiled.support
+    for path in ("/floor", "/floor", "/back"):
+        mask = repainted(soft_mask(path, 3), rng)
+        rest = np.full((len(mask.texels), 2, 2, 3), 7.0, np.float32)
+        edits = (with_mask(shown.stack.edits[0], "receiver_mask", replace(mask, rest=rest)), shown.stack.edits[1])
+        shown.set_stack(replace(stack, edits=edits))
+        found = shown.frame()
+        np.testing.assert_array_equal(found, fresh(of, shown.stack, np.ones((2, 3), np.float32)).frame())
+        assert not np.array_equal(found, seen)
+        assert shown._stack.compiled.support is support
+    shown.set_stack(before)
+    np.testing.assert_array_equal(shown.frame(), seen)
 
 
 def test_offsets_of_all_casters_stay_when_the_edit_of_some_changes():
@@ -419,7 +507,7 @@ def test_casters_painted_at_rest_have_all_rows(monkeypatch):
     again = fresh_packed(of, rows, shown.stack, np.ones((2, 3)))
     again.frame()
     painted = shown._versions
-    pairs = np.concatenate([painted._pairs_of[v] for v, version in enumerate(painted._versions) if 1 in version.rows])
+    pairs = np.concatenate([painted._pairs.of_version[v] for v in range(painted.n) if 1 in painted._rows_of(v)])
     assert len(pairs)
     np.testing.assert_array_equal(painted.values[:, pairs], again._versions.values[:, pairs])
     while shown.refine():
