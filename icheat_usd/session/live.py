@@ -39,7 +39,8 @@ from icheat_usd.session.dabs import dabbed, filled_mask
 from icheat_usd.session.document import Session
 from icheat_usd.session.light_changes import all_lights, changed_light, new_light
 from icheat_usd.session.live_authoring import LiveAuthoring
-from icheat_usd.session.live_frames import Level, Listener, LiveFrames
+from icheat_usd.session.live_events import Level, Listener
+from icheat_usd.session.live_frames import LiveFrames
 from icheat_usd.session.live_history import LiveHistory, Step
 from icheat_usd.session.live_state import LightChange, LiveState, moved, number, numbers
 from icheat_usd.session.quality import LIVE, Quality

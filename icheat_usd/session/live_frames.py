@@ -6,15 +6,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
-from enum import StrEnum
 
 from icheat_usd.edits.model import EMPTY_STACK, EditStack
 from icheat_usd.errors import IcheatError
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.progress import silent
-from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.scene import SceneSnapshot
 from icheat_usd.session import authoring
 from icheat_usd.session.background import Background, Job, Stopped
 from icheat_usd.session.content_keys import digest
@@ -23,43 +21,13 @@ from icheat_usd.session.document import Session
 from icheat_usd.session.evaluator import Evaluator
 from icheat_usd.session.first_look import surfaces_by_headlight
 from icheat_usd.session.frames import ResidentFrames, SharedParts, share_tables
+from icheat_usd.session.live_events import Level, Listener, LiveEvent
 from icheat_usd.session.live_state import UNCHANGED, LiveState
 from icheat_usd.session.quality import coarse
 from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.transport import Transport
 from icheat_usd.transport.packed import PackedTransport
-
-
-class Level(StrEnum):
-    """How good the image of a frame is."""
-
-    NONE = "none"
-    PREVIEW = "preview"  #: coarse, for orientation
-    FULL = "full"  #: all rows that the quality asks for; lights that moved may still be noisy
-    REST = "rest"  #: nothing is left to be done
-
-    def reaches(self, other: Level) -> bool:
-        return _ORDER[self] >= _ORDER[other]
-
-
-_ORDER = {level: i for i, level in enumerate(Level)}
-
-
-@dataclass(frozen=True)
-class LiveEvent:
-    """What listeners hear; from the background thread, so hand it on to the window's own."""
-
-    kind: str  #: "surfaces" (an `image` until there is light), "progress", "better" (show the frame again) or "error"
-    frame: float | None
-    level: Level
-    step: str = ""
-    fraction: float = 0.0
-    error: Exception | None = None
-    image: F32 | None = None  #: (height, width, 3) scene-linear
-
-
-Listener = Callable[[LiveEvent], None]
 
 #: Frames whose parts are kept while they are being made, or when another one interrupted them.
 _MOST_UNFINISHED = 2

@@ -11,7 +11,7 @@ import pytest
 from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.session import Quality, Session
 from icheat_usd.session.live import LiveSession
-from icheat_usd.session.live_frames import Level, LiveEvent
+from icheat_usd.session.live_events import Level, LiveEvent
 from tests.session.test_session import ROOM
 
 QUALITY = Quality(n_gather=192, rays_per_row=16, rays_per_bounce_row=16, light_samples=2, n_bounces=3)

@@ -14,7 +14,7 @@ from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.session import Quality, Session, shot_parts
 from icheat_usd.session.live import LiveSession
-from icheat_usd.session.live_frames import LiveEvent
+from icheat_usd.session.live_events import LiveEvent
 from icheat_usd.session.live_state import UNCHANGED
 from tests.session.test_session import ROOM
 
