@@ -24,7 +24,7 @@ from tools.benchmarking.meter import PeakMemory, repeat, summary
 from tools.benchmarking.parts import Effort, Parts, with_movable_lights
 from tools.benchmarking.test_lights import TestLight, add_lights
 
-_RAYS = {"record_rays": 512, "rays_per_bounce_row": 32, "light_samples": 4}
+_RAYS = {"record_rays": 512, "rays_per_bounce_row": 32, "light_samples": 4, "dome_samples": 4}
 _LIGHTS, _EDITS = (1, 8, 32), (0, 16, 64)
 _TRIANGLES = (10_000, 100_000, 1_000_000)
 _QUICK_LIGHTS, _QUICK_EDITS, _QUICK_TRIANGLES = (1, 3), (0, 4), (100, 400)

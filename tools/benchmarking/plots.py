@@ -35,6 +35,10 @@ def _curve(results: list[dict[str, Any]], path: Path) -> bool:
     for name, points in curves.items():
         axes.plot([p["fps"] for p in points], [100 * p["total"] for p in points], "o-", label=f"{name}, total")
         axes.plot([p["fps"] for p in points], [100 * p["packing"] for p in points], "o--", label=f"{name}, packing")
+        for point in points:
+            place = (point["fps"], 100 * point["total"])
+            axes.annotate(f"{100 * point['tolerance']:g} %", place, (3, 4), textcoords="offset points", fontsize=6)
+    axes.set_title("by the error that packing may add", fontsize=9)
     axes.set_xlabel("frames per second, light colour")
     axes.set_ylabel("relative RMS error, %")
     axes.set_yscale("log")
