@@ -12,7 +12,7 @@ from numba.core import event
 
 @contextmanager
 def told_of_compiling(tell: Callable[[int, str], None]) -> Iterator[None]:
-    """Have `tell` called before each kernel that this thread compiles in the block, not for those found on disk.
+    """Have `tell` called before each function that this thread compiles in the block, not for those found on disk.
 
     It is given how many it has been so far, and the name of this one. It must not raise.
     """
@@ -26,9 +26,11 @@ class _Listener(event.Listener):  # type: ignore[misc]
         self._tell, self._thread, self._n = tell, threading.get_ident(), 0
 
     def on_start(self, event: Any) -> None:
-        if threading.get_ident() == self._thread:
+        function = event.data["dispatcher"].py_func
+        # Numba's own are small, and their names say nothing.
+        if threading.get_ident() == self._thread and not function.__module__.startswith("numba."):
             self._n += 1
-            self._tell(self._n, event.data["dispatcher"].py_func.__name__)
+            self._tell(self._n, function.__name__)
 
     def on_end(self, event: Any) -> None:
         """Nothing to say."""
