@@ -21,7 +21,7 @@ class Quality:
     shared_rays: bool = False  #: the same rays from all of these: a smooth shade instead of noise
     record_error: float | None = None  #: relative RMS error that rows kept where they are needed, instead of on a grid,
     #: may add by interpolation; None keeps them on the grid of `row_spacing`
-    record_rays: int = 2048  #: gather rays of each such row
+    record_rays: int = 1536  #: gather rays of such a row, on average
     packing_error: float | None = None  #: relative RMS error that packed rows may add; None keeps them exact
     light_samples: int = 16  #: shadow rays per light and point
     dome_samples: int | None = None  #: for the direct light of domes in the image; 4 `light_samples` by default

@@ -11,6 +11,7 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
+from icheat_usd.transport.allotment import Counts
 from icheat_usd.transport.interpolate import sparse_rows_of_view
 from icheat_usd.transport.rays import RowBuilder
 from icheat_usd.transport.sparse import SparseRows
@@ -40,6 +41,7 @@ class Transport:
     rays_per_row: int = 256  #: that the rows were measured with
     seed: int = 0  #: of these rays
     stream: I64 | None = None  #: (n_rows,) sequence that each row's rays are from; None: its view sample's number
+    counts: Counts | None = None  #: rays of each row, where they differ; `rays_per_row` is their mean then
 
     def to_view(self, radiance: F32) -> F32:
         """Indirect radiance that view samples send to the eye.

@@ -12,7 +12,7 @@ from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer, first_surfaces
 from icheat_usd.transport.build import Lobe, Transport
-from icheat_usd.transport.rays import RowBuilder, scatter_rows
+from icheat_usd.transport.rays import RowBuilder, scatter_rows, specular_counts
 from icheat_usd.transport.sparse import SparseRows
 
 #: Sets of rows that are kept: one for each edit that an artist goes back and forth between.
@@ -72,13 +72,25 @@ class HeldBack:
         clear = build_tracer(self._snapshot, self._tracer.engine, hidden=occluders)
         try:
             builder = _BehindOccluders(self._snapshot, self._tracer, clear, self._gather, transport.seed, occluders)
-            one_each = np.arange(len(which) + 1, dtype=np.int64)
-            rays = transport.rays_per_row
             stream = row_view if transport.stream is None else transport.stream[which]
-            found = [builder.diffuse_rows(points, one_each, stream, rays, 0, self._progress, "rays behind occluders")]
-            glossy = np.flatnonzero(is_glossy(points))
+            counts, glossy = transport.counts, np.flatnonzero(is_glossy(points))
+            diffuse, specular = (
+                (np.full(len(which), transport.rays_per_row), specular_counts(points, glossy, transport.rays_per_row))
+                if counts is None
+                else (counts.diffuse[which], counts.specular[which][glossy])
+            )
+            parts = []
+            for rays in np.unique(diffuse).tolist():
+                some = np.flatnonzero(diffuse == rays)
+                one_each = np.arange(len(some) + 1, dtype=np.int64)
+                part = take_points(points, some)
+                rows = builder.diffuse_rows(
+                    part, one_each, stream[some], rays, 0, self._progress, "rays behind occluders"
+                )
+                parts.append((some, rows))
+            found = [scatter_rows(parts, len(which), self._gather.n)]
             if len(glossy):
-                found += builder.specular_rows(points, view.to_eye[row_view], stream, glossy, rays, self._progress)
+                found += builder.specular_rows(points, view.to_eye[row_view], stream, glossy, specular, self._progress)
         finally:
             clear.close()
         return tuple(

@@ -10,7 +10,7 @@ import numpy as np
 from icheat_usd.kernels import outliers as kernels
 from icheat_usd.scene import F32, F64, I32, I64, Bool
 from icheat_usd.transport.records import Records, RecordSettings
-from icheat_usd.transport.sparse import SparseRows, select_rows
+from icheat_usd.transport.sparse import SparseRows, select_rows, take_rows
 
 _ROUNDS = 8  # of records, each of which may spare their neighbours one
 _LEAST = 0.0005  # of the samples: outliers for which a round is worth its time
@@ -32,7 +32,7 @@ class Survey:
     specular: F32  #: (n, 2, n_lights) the same for the specular lobes, from one set
 
 
-class _Scores(NamedTuple):
+class Scores(NamedTuple):
     """Squared error of samples, as multiples of the image's mean square."""
 
     sure: F64  #: what both sets of rays say, never negative
@@ -59,7 +59,7 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
     """
     mesh = records.mesh
     view = mesh.view
-    judge = _Judge(survey, tint, records, view.height, view.width, view.pixel)
+    judge = Judge(survey, tint, records, view.height, view.width, view.pixel)
     table = records.interpolation
     everything = np.arange(view.n)
     scores = judge.scores(everything, table, mesh.record_view)
@@ -87,38 +87,38 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
     return replace(records, view=mesh.record_view.astype(np.int32), interpolation=table, error=error)
 
 
-class _Judge:
+class Judge:
     """Errors of interpolation, relative to the images that the lights make."""
 
     def __init__(self, survey: Survey, tint: F32, records: Records, height: int, width: int, pixel: I32) -> None:
         self._survey, self._tint = survey, np.ascontiguousarray(tint, np.float32)
         self._shape, self._pixel = (height, width), pixel
         n_view = len(survey.diffuse)
-        self._gloss_of = np.full(n_view, -1, np.int64)
-        self._gloss_of[survey.glossy] = np.arange(len(survey.glossy))
+        self.gloss_of = np.full(n_view, -1, np.int64)
+        self.gloss_of[survey.glossy] = np.arange(len(survey.glossy))
         # The error of no interpolation at all is the image.
         some = np.arange(0, n_view, max(1, n_view // _CHUNK))
         one, two = self._errors(some, SparseRows.empty(len(some), 1), np.zeros(1, np.int64)).transpose(1, 0, 2)
         square = np.maximum(np.mean(one * two, axis=0, dtype=np.float64), 0)
-        part = _take(records.interpolation, some)
+        part = take_rows(records.interpolation, some)
         one, two = self._errors(some, part, records.view.astype(np.int64)).transpose(1, 0, 2)
         per_square = np.where(square > 0, 1 / np.where(square > 0, square, 1), 0)
         noise = 0.5 * np.mean((one - two) ** 2, axis=0, dtype=np.float64) * per_square
         weight = np.where(square > 0, 1 / (_NOISE + noise), 0)
-        self._weight = (weight / max(weight.sum(), 1e-30) * per_square).astype(np.float32)
+        self.weight = (weight / max(weight.sum(), 1e-30) * per_square).astype(np.float32)  #: (n_lights,)
 
-    def scores(self, samples: I64, table: SparseRows, record_view: I64) -> _Scores:
+    def scores(self, samples: I64, table: SparseRows, record_view: I64) -> Scores:
         """Of some samples, whose rows the table holds: (n,) each."""
-        out = _Scores(np.empty(len(samples)), np.empty(len(samples)), np.empty(len(samples)))
+        out = Scores(np.empty(len(samples)), np.empty(len(samples)), np.empty(len(samples)))
         for first in range(0, len(samples), _CHUNK):
             part = slice(first, min(first + _CHUNK, len(samples)))
             wrong = self._errors(samples[part], table.rows(part.start, part.stop), record_view)
             one, two = wrong[:, 0], wrong[:, 1]
             product = one * two
             least = np.minimum(np.abs(one), np.abs(two))
-            out.sure[part] = np.where(product > 0, least * least, 0) @ self._weight
-            out.mean[part] = product @ self._weight
-            out.noise[part] = 0.5 * (one - two) ** 2 @ self._weight
+            out.sure[part] = np.where(product > 0, least * least, 0) @ self.weight
+            out.mean[part] = product @ self.weight
+            out.noise[part] = 0.5 * (one - two) ** 2 @ self.weight
         return out
 
     def _errors(self, samples: I64, table: SparseRows, record_view: I64) -> F32:
@@ -131,7 +131,7 @@ class _Judge:
             table.weights,
             record_view,
             survey.diffuse,
-            self._gloss_of,
+            self.gloss_of,
             survey.specular,
             self._tint,
             out,
@@ -157,7 +157,3 @@ class _Judge:
             for dx in range(3):
                 around = np.maximum(around, image[dy : dy + height, dx : dx + width])
         return values[samples] >= around.reshape(-1)[self._pixel[samples]]
-
-
-def _take(table: SparseRows, rows: I64) -> SparseRows:
-    return select_rows(SparseRows.empty(len(rows), table.n_columns), table, np.arange(len(rows)), rows)

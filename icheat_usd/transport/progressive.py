@@ -8,18 +8,19 @@ from functools import partial
 import numpy as np
 
 from icheat_usd.errors import IcheatError
-from icheat_usd.kernels.rows import place_rows
 from icheat_usd.materials import is_glossy, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.scene import F32, I32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
+from icheat_usd.transport.allotment import Counts, allot_rays
 from icheat_usd.transport.build import Lobe, Transport
+from icheat_usd.transport.fitting import fit_weights
 from icheat_usd.transport.outliers import Survey, add_outliers
 from icheat_usd.transport.pieces import PartStore, Pieces
-from icheat_usd.transport.rays import MOST_RAYS, MeasuredRows, RowBuilder
+from icheat_usd.transport.rays import MOST_RAYS, MeasuredRows, RowBuilder, scatter_rows, specular_counts
 from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
-from icheat_usd.transport.sparse import SparseRows, concatenate_rows
+from icheat_usd.transport.sparse import SparseRows, concatenate_rows, take_rows
 
 #: Rays of a row while records are placed. All rows have the same, so that neighbours differ by what they see.
 _PLACING_RAYS = 128
@@ -27,7 +28,9 @@ _PLACING_RAYS = 128
 _SURVEY_RAYS = 64
 _STRONG = 0.2  # reflectance: what reflects less follows from its neighbours, or is not missed
 _SURVEYED_AT_ONCE = 1 << 15  # samples, whose rows are held in memory
+_FIRST_RAYS = 256  # of each record by itself, by which the others are allotted
 _GROWTH = 4  # of the rays from one transport to the next
+_TILE = (8, 16)  # pixels: places whose rays are traced together
 _LOBES = ("diffuse", "specular_base", "specular_edge")
 
 
@@ -51,7 +54,7 @@ def build_transports(
     training : (n_lights, n_gather) float32
         What plausible lights make leave the cells: `training_radiance`.
     rays_per_row
-        Of the last transport, per record and lobe; at most `MOST_RAYS`.
+        Of the last transport, the mean over the records; at most `MOST_RAYS`. See `allot_rays`.
     parts
         Where rows that were traced before are found, and those that are traced now are kept.
 
@@ -90,25 +93,25 @@ def build_transports(
             points, one_each, stream, n_rays, 0, progress, "gather rays", first_ray=first_ray, of_rays=of_rays
         )
 
-    def trace_specular(samples: I64, stream: I64, n_rays: int) -> tuple[SparseRows, SparseRows]:
+    def trace_specular(samples: I64, stream: I64, counts: I64) -> tuple[SparseRows, SparseRows]:
         points = take_points(view.points, samples)
-        glossy = np.flatnonzero(is_glossy(points))
+        glossy = np.flatnonzero(counts)
         if not len(glossy):
             nothing = SparseRows.empty(len(samples), gather.n)
             return nothing, nothing
-        return builder.specular_rows(points, view.to_eye[samples], stream, glossy, n_rays, progress)
+        return builder.specular_rows(points, view.to_eye[samples], stream, glossy, counts[glossy], progress)
 
-    def rows_of(samples: I64, stream: I64, first_ray: int, n_rays: int, of_rays: int) -> MeasuredRows:
+    def rows_of(samples: I64, stream: I64, first_ray: int, n_rays: int) -> MeasuredRows:
         def make(rows: I64) -> MeasuredRows:
-            return trace(samples[rows], stream[rows], first_ray, n_rays, of_rays)
+            return trace(samples[rows], stream[rows], first_ray, n_rays, first_ray + n_rays)
 
         return pieces.measured(np.arange(len(samples)), n_rays, make)
 
-    def specular(samples: I64, stream: I64, n_rays: int) -> list[SparseRows]:
+    def specular(samples: I64, stream: I64, counts: I64) -> list[SparseRows]:
         def make(rows: I64) -> tuple[SparseRows, SparseRows]:
-            return trace_specular(samples[rows], stream[rows], n_rays)
+            return trace_specular(samples[rows], stream[rows], counts[rows])
 
-        return list(pieces.both(np.arange(len(samples)), n_rays, make))
+        return list(pieces.both(np.arange(len(samples)), int(counts.mean()) + 1 if len(counts) else 1, make))
 
     def look(samples: I64) -> F32:
         """Diffuse light by few rays, in two halves: (n, 2, n_lights)."""
@@ -117,28 +120,34 @@ def build_transports(
         return np.stack(parts, axis=1)
 
     def look_specular(samples: I64) -> F32:
-        both = trace_specular(samples, np.zeros_like(samples), _SURVEY_RAYS)
+        both = trace_specular(samples, np.zeros_like(samples), _glossy_counts(view, samples, _SURVEY_RAYS))
         return np.stack([rows.matmul(lights) for rows in both], axis=1)
 
     def survey() -> Survey:
         """The light at every view sample."""
-        reflects = is_glossy(view.points) & (view.points.specular.max(axis=1) >= _STRONG)
-        glossy = np.flatnonzero(reflects)
-        diffuse = [pieces.get(partial(look, samples)) for samples in _chunks(np.arange(view.n))]
-        reflected = [pieces.get(partial(look_specular, samples)) for samples in _chunks(glossy)]
-        return Survey(np.concatenate(diffuse), glossy, np.concatenate(reflected))
+        order = _in_image_tiles(view, np.arange(view.n))
+        strong = is_glossy(view.points) & (view.points.specular.max(axis=1) >= _STRONG)
+        glossy = order[strong[order]]
+        diffuse = np.concatenate([pieces.get(partial(look, samples)) for samples in _chunks(order)])
+        reflected = np.concatenate([pieces.get(partial(look_specular, samples)) for samples in _chunks(glossy)])
+        by_sample = np.empty_like(diffuse)
+        by_sample[order] = diffuse
+        ascending = np.argsort(glossy)
+        return Survey(by_sample, glossy[ascending], reflected[ascending])
 
     def probe(samples: I64) -> F32:
+        order = _in_image_tiles(view, samples)
+        back, some = np.argsort(order), samples[order]
         out = np.zeros((2, 3, len(samples), lights.shape[1]), np.float32)
         stream = np.zeros(len(samples), np.int64)
         half = _PLACING_RAYS // 2
-        one = rows_of(samples, stream, 0, half, _PLACING_RAYS)
-        two = rows_of(samples, stream, half, half, _PLACING_RAYS)
-        out[0, 0], out[1, 0] = one.cells.matmul(lights), two.cells.matmul(lights)
-        placed[0].append(one.continued(two).cells)
-        for lobe, rows in enumerate(specular(samples, stream, _PLACING_RAYS), 1):
-            out[:, lobe] = rows.matmul(lights)
-            placed[lobe].append(rows)
+        one = rows_of(some, stream, 0, half)
+        two = rows_of(some, stream, half, half)
+        out[0, 0, order], out[1, 0, order] = one.cells.matmul(lights), two.cells.matmul(lights)
+        placed[0].append(take_rows(one.continued(two).cells, back))
+        for lobe, rows in enumerate(specular(some, stream, _glossy_counts(view, some, _PLACING_RAYS)), 1):
+            out[:, lobe, order] = rows.matmul(lights)
+            placed[lobe].append(take_rows(rows, back))
         return out
 
     settings = settings or RecordSettings()
@@ -146,54 +155,90 @@ def build_transports(
     for records in place_records(view, snapshot.camera, probe, tint, settings):
         rows = [concatenate_rows(list(part), gather.n) for part in placed]
         placed = [[part] for part in rows]
-        yield _transport(view, records, rows, _PLACING_RAYS, seed, np.zeros(len(records.view), np.int64))
+        order, spread = _in_tiles(view, records)
+        stream = np.zeros(len(order), np.int64)
+        yield _transport(view, records.view[order], spread, [take_rows(part, order) for part in rows], seed, stream)
     assert records is not None
     placed.clear()
-    records = add_outliers(records, survey(), tint, settings)
-    samples = records.view.astype(np.int64)
-    measured: MeasuredRows | None = None
-    n_rays = min(rays_per_row, 2 * _PLACING_RAYS)
-    while True:
-        before = measured.n_rays if measured else 0
-        more = rows_of(samples, samples, before, n_rays - before, rays_per_row)
-        measured = measured.continued(more) if measured else more
-        yield _transport(view, records, [measured.cells, *specular(samples, samples, n_rays)], n_rays, seed, None)
-        if n_rays == rays_per_row:
-            return
-        n_rays = min(rays_per_row, n_rays * _GROWTH)
+    seen = survey()
+    records = fit_weights(add_outliers(records, seen, tint, settings), seen, tint)
+    del seen
+
+    order, spread = _in_tiles(view, records)
+    samples = records.view[order].astype(np.int64)
+    n_rays = min(rays_per_row, _FIRST_RAYS)
+    cells = rows_of(samples, samples, 0, n_rays).cells
+    traced = _glossy_counts(view, samples, n_rays)
+    reflected = specular(samples, samples, traced)
+    counts = Counts(np.full(len(samples), n_rays), traced)
+    yield _transport(view, records.view[order], spread, [cells, *reflected], seed, None, counts)
+    if n_rays == rays_per_row:
+        return
+    wanted = allot_rays([cells, *reflected], list(tint), spread, lights, np.flatnonzero(traced), rays_per_row)
+    most = n_rays
+    while most < wanted.diffuse.max() or most == n_rays:
+        most *= _GROWTH
+        groups = []
+        for before, n in np.unique(np.stack([counts.diffuse, np.minimum(wanted.diffuse, most)]), axis=1).T.tolist():
+            which = np.flatnonzero((counts.diffuse == before) & (np.minimum(wanted.diffuse, most) == n))
+            some = MeasuredRows(take_rows(cells, which), before)
+            if n > before:
+                some = some.continued(rows_of(samples[which], samples[which], before, n - before))
+            groups.append((which, some.cells))
+        cells = scatter_rows(groups, len(samples), gather.n)
+        if counts.specular is traced:
+            reflected = specular(samples, samples, wanted.specular)
+        counts = Counts(np.minimum(wanted.diffuse, most), wanted.specular)
+        yield _transport(view, records.view[order], spread, [cells, *reflected], seed, None, counts)
+
+
+def _glossy_counts(view: ViewSamples, samples: I64, n_rays: int) -> I64:
+    """Specular rays of some view samples where each gets as many as its reflectance is worth."""
+    points = take_points(view.points, samples)
+    glossy = np.flatnonzero(is_glossy(points))
+    out = np.zeros(len(samples), np.int64)
+    out[glossy] = specular_counts(points, glossy, n_rays)
+    return out
 
 
 def _chunks(samples: I64) -> list[I64]:
     return np.split(samples, range(_SURVEYED_AT_ONCE, len(samples), _SURVEYED_AT_ONCE))
 
 
-def _transport(
-    view: ViewSamples, records: Records, rows: list[SparseRows], n_rays: int, seed: int, stream: I64 | None
-) -> Transport:
-    points = view.points
-    order = tile_order(points.position[records.view], points.shading_normal[records.view])
-    tints = points.albedo, points.specular, points.specular_edge
-    lobes = [
-        Lobe(name, _in_order(part, order), tint)
-        for name, part, tint in zip(_LOBES, rows, tints, strict=True)
-        if name == "diffuse" or part.n_entries
-    ]
+def _in_image_tiles(view: ViewSamples, samples: I64) -> I64:
+    """Order in which samples that follow each other are neighbours: their rays meet the same surfaces."""
+    y, x = view.pixel[samples] // view.width, view.pixel[samples] % view.width
+    return np.lexsort((samples, x // _TILE[0], y // _TILE[1]))
+
+
+def _in_tiles(view: ViewSamples, records: Records) -> tuple[I64, SparseRows]:
+    """Order of the records in a transport, and the interpolation between them in that order."""
+    order = tile_order(view.points.position[records.view], view.points.shading_normal[records.view])
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     weights = records.interpolation
     column = place[weights.indices]
     entry = np.lexsort((column, np.repeat(np.arange(weights.n_rows), np.diff(weights.indptr))))
-    spread = SparseRows(weights.indptr, column[entry], weights.weights[entry], weights.n_columns)
-    return Transport(tuple(lobes), records.view[order], spread, n_rays, seed, None if stream is None else stream[order])
+    return order, SparseRows(weights.indptr, column[entry], weights.weights[entry], weights.n_columns)
 
 
-def _in_order(rows: SparseRows, order: I64) -> SparseRows:
-    indptr = np.concatenate([[0], np.cumsum(np.diff(rows.indptr)[order])])
-    out = SparseRows(indptr, np.empty_like(rows.indices), np.empty_like(rows.weights), rows.n_columns)
-    begin = np.empty(len(order), np.int64)
-    begin[order] = indptr[:-1]
-    place_rows(rows.indptr, begin, rows.indices, rows.weights, out.indices, out.weights)
-    return out
+def _transport(
+    view: ViewSamples,
+    row_view: I32,
+    spread: SparseRows,
+    rows: list[SparseRows],
+    seed: int,
+    stream: I64 | None,
+    counts: Counts | None = None,
+) -> Transport:
+    tints = view.points.albedo, view.points.specular, view.points.specular_edge
+    lobes = [
+        Lobe(name, part, tint)
+        for name, part, tint in zip(_LOBES, rows, tints, strict=True)
+        if name == "diffuse" or part.n_entries
+    ]
+    mean = _PLACING_RAYS if counts is None else int(np.rint(counts.diffuse.mean())) if len(row_view) else 0
+    return Transport(tuple(lobes), row_view, spread, mean, seed, stream, counts)
 
 
 def _scalar(tint: F32) -> F32:

@@ -226,19 +226,25 @@ class RowBuilder:
         return which, column, units
 
     def specular_rows(
-        self, points: SurfacePoints, to_eye: F32, stream: I64, glossy: I64, n_rays: int, progress: Progress
+        self, points: SurfacePoints, to_eye: F32, stream: I64, glossy: I64, n_rays: int | I64, progress: Progress
     ) -> tuple[SparseRows, SparseRows]:
         """Rows that multiply the specular colour, and rows that multiply the specular edge.
 
         Both stand on the same directions, and share their columns in memory.
-        Weak reflections, of all dielectrics, take a quarter of the rays: their
-        noise is scaled down by their reflectance.
+
+        Parameters
+        ----------
+        glossy : (n_glossy,)
+            Which points reflect, ascending.
+        n_rays
+            Of each of these, (n_glossy,); one number is for strong reflections, see `specular_counts`.
         """
         seed = self._seed_for(2)
-        weak = points.specular[glossy].max(axis=1) < _WEAK_SPECULAR
+        counts = specular_counts(points, glossy, n_rays) if isinstance(n_rays, int) else n_rays
         second: list[F32] = []
         parts: list[tuple[I64, SparseRows, F32]] = []
-        for rows, rays in ((glossy[~weak], n_rays), (glossy[weak], max(1, n_rays // 4))):
+        for rays in np.unique(counts).tolist():
+            rows = glossy[counts == rays]
 
             def row_chunk(first: int, last: int, rows: I64 = rows, rays: int = rays) -> SparseRows:
                 start = np.repeat(rows[first:last], rays)
@@ -255,10 +261,9 @@ class RowBuilder:
                 second.append(edge)
                 return base
 
-            if len(rows):
-                base = self._in_chunks(len(rows), rays, row_chunk, progress, "glossy gather rays", _RAYS_AT_ONCE // 4)
-                parts.append((rows, base, np.concatenate(second)))
-                second.clear()
+            base = self._in_chunks(len(rows), rays, row_chunk, progress, "glossy gather rays", _RAYS_AT_ONCE // 4)
+            parts.append((rows, base, np.concatenate(second)))
+            second.clear()
 
         whole = scatter_rows([(rows, base) for rows, base, _ in parts], len(stream), self._gather.n)
         if len(parts) == 1:
@@ -362,6 +367,15 @@ class _Counter:
         self.n_keys = n_keys
         self.count = np.zeros((lanes, n_keys), np.int32)
         self.mark = np.zeros((lanes, -(-n_keys // 64)), np.uint64)
+
+
+def specular_counts(points: SurfacePoints, glossy: I64, n_rays: int) -> I64:
+    """Rays of the specular rows of some points: weak reflections, of all dielectrics, take a quarter.
+
+    Their noise is scaled down by their reflectance.
+    """
+    weak = points.specular[glossy].max(axis=1) < _WEAK_SPECULAR
+    return np.where(weak, max(1, n_rays // 4), n_rays).astype(np.int64)
 
 
 def _counted(row: I64, which: I64, column: I64, units: I64, n_rows: int, n_columns: int) -> SparseRows:

@@ -14,7 +14,7 @@ from icheat_usd.samples import ViewSamples
 from icheat_usd.scene import F32, F64, I32, I64, Bool, Camera
 from icheat_usd.transport.sparse import SparseRows
 
-_BUCKET = 8  # pixels
+BUCKET = 8  # pixels
 _LEAST_GAIN = 0.005  # of the number of records: blocks to divide for which another round of rays is worth its time
 _FAINT = 0.02  # of the light that arrives: what shows less, as reflections in glass do, gets no records of its own
 _FOR_BLOCKS = 0.57  # of the records: some are left for sheets that were found by no corner, and for outliers
@@ -77,19 +77,19 @@ class Mesh:
         left, right, bottom, top = camera.window
         shape = view.height, view.width
         size = (right - left) / view.width
-        self._extent = np.full(view.n, size, np.float32)
+        self.extent = np.full(view.n, size, np.float32)
         self._nearness = np.ones(view.n, np.float32)
         if not camera.orthographic:
             x = left + (view.pixel % view.width + 0.5) * size
             y = top - (view.pixel // view.width + 0.5) / view.height * (top - bottom)
             depth = np.maximum(view.depth, np.float32(1e-20))
-            self._extent *= depth
+            self.extent *= depth
             self._nearness = (np.sqrt(x * x + y * y + 1) / depth).astype(np.float32)
         self.first = np.full(shape, -1, np.int64)
         self.first.reshape(-1)[view.pixel[::-1]] = np.arange(view.n)[::-1]
         self._corners = np.empty(view.n, np.float32)
         kernels.corner_distance(
-            self.first, view.points.position, view.points.shading_normal, self._extent, view.pixel, self._corners
+            self.first, view.points.position, view.points.shading_normal, self.extent, view.pixel, self._corners
         )
         self.level = np.full(shape, coarsest.bit_length() - 1, np.int32)
         self.parent = self.level.copy()  #: before the last division
@@ -108,16 +108,20 @@ class Mesh:
         self.record[samples] = np.arange(len(samples), dtype=np.int32) + len(self.record_view)
         self.record_view = np.concatenate([self.record_view, samples])
 
+    def buckets(self) -> tuple[I64, I64]:
+        """Records by blocks of `BUCKET` pixels, row by row: first of each, (n_blocks + 1,), and records."""
+        view, pixel = self.view, self.view.pixel[self.record_view]
+        n_x = (view.width + BUCKET - 1) // BUCKET
+        n_y = (view.height + BUCKET - 1) // BUCKET
+        bucket = pixel // view.width // BUCKET * n_x + pixel % view.width // BUCKET
+        record = np.argsort(bucket, kind="stable")
+        return np.searchsorted(bucket[record], np.arange(n_x * n_y + 1)), record
+
     def weights(self, samples: I64, strict: bool = True) -> _Weights:
         """Of some samples; without `strict` records of other sheets will do."""
         view = self.view
         record_at = np.where(self.first >= 0, self.record[np.maximum(self.first, 0)], -1).astype(np.int32)
-        pixel = view.pixel[self.record_view]
-        n_x = (view.width + _BUCKET - 1) // _BUCKET
-        n_y = (view.height + _BUCKET - 1) // _BUCKET
-        bucket = pixel // view.width // _BUCKET * n_x + pixel % view.width // _BUCKET
-        bucket_record = np.argsort(bucket, kind="stable")
-        bucket_begin = np.searchsorted(bucket[bucket_record], np.arange(n_x * n_y + 1))
+        bucket_begin, bucket_record = self.buckets()
         n = len(samples)
         count = np.empty(n, np.int64)
         record = np.empty((n, kernels.MAX_ENTRIES), np.int32)
@@ -129,7 +133,7 @@ class Mesh:
             view.points.position,
             view.points.shading_normal,
             view.points.instance,
-            self._extent,
+            self.extent,
             self._corners,
             self._nearness,
             self.level,
@@ -137,7 +141,7 @@ class Mesh:
             record_at,
             self.record,
             self.record_view,
-            _BUCKET,
+            BUCKET,
             bucket_begin,
             bucket_record,
             int(strict),

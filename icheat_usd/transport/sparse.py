@@ -135,3 +135,8 @@ def select_rows(base: SparseRows, other: SparseRows, rows: I64, of_other: I64) -
     indices = np.concatenate([base.indices, other.indices])[source]
     weights = np.concatenate([base.weights, other.weights])[source]
     return SparseRows(indptr, indices, weights, other.n_columns)
+
+
+def take_rows(rows: SparseRows, which: I64) -> SparseRows:
+    """Some rows of a matrix, in the order given."""
+    return select_rows(SparseRows.empty(len(which), rows.n_columns), rows, np.arange(len(which)), which)

@@ -20,7 +20,7 @@ from icheat_usd.tracing import Tracer, first_surfaces, spawn_points, transmittan
 from icheat_usd.transport.bounces import Bounces
 
 _PLACES = 4096  # rays whose ends say where in the scene there is room for lights
-_PATCHES = 4  # patch points of a cell that are lit: the rest would make edges sharper, and nothing else
+_PATCHES = 2  # patch points of a cell that are lit: the rest would make edges sharper, and nothing else
 _SKY_RAYS = 16  # per cell, shared by all domes
 _BOUNCES = 5  # indirect light is soft: later bounces look like these
 _TRIES = 16  # places for a light before one that lights nothing is given up
@@ -62,7 +62,7 @@ class _Shape:
 
 
 def training_radiance(
-    snapshot: SceneSnapshot, tracer: Tracer, gather: GatherSamples, bounces: Bounces, n: int = 24, seed: int = 0
+    snapshot: SceneSnapshot, tracer: Tracer, gather: GatherSamples, bounces: Bounces, n: int = 48, seed: int = 0
 ) -> F32:
     """What `n` plausible lights make leave the gather cells, after some bounces.
 
