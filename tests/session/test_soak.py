@@ -11,7 +11,7 @@ from icheat_usd.session import LiveSession, Quality, Session, live_history
 from tests.session.test_session import ROOM
 from tools.soaking import soak
 
-QUALITY = Quality(n_gather=96, rays_per_row=8, rays_per_bounce_row=8, light_samples=1, n_bounces=2)
+QUALITY = Quality(n_gather=96, rays_per_row=8, rays_per_bounce_row=8, light_samples=1, n_bounces=2, packing_error=0.1)
 
 
 def test_random_commands_leave_memory_flat_and_end_where_a_fresh_session_does(
