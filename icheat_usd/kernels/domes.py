@@ -8,9 +8,10 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import parallel_kernel
+from icheat_usd.kernels.environment import Table, dome_lookup
 
 ROWS, COLUMNS = 64, 128  #: bins of equal solid angle: bands of equal height, cut by longitude
-_BLOCK = 256
+_BLOCK, _BINS = 256, 64  # of a task
 
 
 @parallel_kernel
@@ -22,6 +23,41 @@ def find_bins(directions: np.ndarray, out: np.ndarray) -> None:
             row = min(max(int((1.0 - y) * 0.5 * ROWS), 0), ROWS - 1)
             column = int((math.atan2(x, z) / (2.0 * math.pi) + 0.5) * COLUMNS)
             out[i] = row * COLUMNS + min(max(column, 0), COLUMNS - 1)
+
+
+@parallel_kernel
+def bin_sky(
+    textures: Table, texture: int, radiance: np.ndarray, to_local: np.ndarray, directions: np.ndarray, out: np.ndarray
+) -> None:
+    """Mean radiance of one dome over the directions of each bin.
+
+    Parameters
+    ----------
+    texture : int
+        Row of its image; -1: none.
+    radiance : (3,) float32
+    to_local : (3, 3) float64, from the world to the dome
+    directions : (n_bins, n_looks, 3) float32, world space, any length
+    out : (n_bins, 3) float32
+    """
+    for block in prange((len(out) + _BINS - 1) // _BINS):
+        for i in range(block * _BINS, min(len(out), (block + 1) * _BINS)):
+            red, green, blue = 0.0, 0.0, 0.0
+            for look in range(directions.shape[1]):
+                dx, dy, dz = directions[i, look, 0], directions[i, look, 1], directions[i, look, 2]
+                x = to_local[0, 0] * dx + to_local[0, 1] * dy + to_local[0, 2] * dz
+                y = to_local[1, 0] * dx + to_local[1, 1] * dy + to_local[1, 2] * dz
+                z = to_local[2, 0] * dx + to_local[2, 1] * dy + to_local[2, 2] * dz
+                length = math.sqrt(x * x + y * y + z * z)
+                r, g, b = 1.0, 1.0, 1.0
+                if texture >= 0:
+                    r, g, b = dome_lookup(textures, texture, x / length, y / length, z / length)
+                red += r
+                green += g
+                blue += b
+            out[i, 0] = red / directions.shape[1] * radiance[0]
+            out[i, 1] = green / directions.shape[1] * radiance[1]
+            out[i, 2] = blue / directions.shape[1] * radiance[2]
 
 
 @parallel_kernel

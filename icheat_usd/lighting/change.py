@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 from icheat_usd.errors import IcheatError
 from icheat_usd.scene import F32, LightKind, Lights, SceneSnapshot, Textures
 
+_SPARE_IMAGES = 4  # of the size of the first one, for which there is room before all is copied
+
 
 class LightError(IcheatError):
     """A light cannot be changed the way that was asked for."""
@@ -36,12 +38,12 @@ def one_light(snapshot: SceneSnapshot, light: int) -> SceneSnapshot:
 
 def join_lights(snapshot: SceneSnapshot, alone: list[SceneSnapshot]) -> SceneSnapshot:
     """The scene lit by the lights of `alone`, one-light snapshots, in their order; their images stand after its own."""
-    textures = snapshot.textures
+    textures, n_own = snapshot.textures, len(snapshot.textures.begin)
     parts = []
     for part in alone:
         lights = part.lights
-        if lights.texture[0] >= len(snapshot.textures.begin):
-            textures, row = append_texture(textures, texture_image(part.textures, int(lights.texture[0])))
+        if lights.texture[0] >= n_own:
+            textures, row = _with_row_of(textures, part.textures, int(lights.texture[0]))
             lights = lights._replace(texture=np.array([row], np.int32))
         parts.append(lights)
     begin = np.concatenate([[0], np.cumsum([len(part.triangle) for part in parts])]).astype(np.int64)
@@ -70,8 +72,59 @@ def no_lights() -> Lights:
     )
 
 
+class LightImages:
+    """Images that lights get one after another, behind those of a scene.
+
+    All texels lie in one array, so that a new image copies no others but when there is no room left. Where an image
+    lies says which it is: no place is used twice.
+    """
+
+    def __init__(self, textures: Textures) -> None:
+        self._own = textures
+        self._store: F32 | None = None
+        self._used = len(textures.texels)
+
+    def add(self, image: F32) -> tuple[Textures, int]:
+        """The scene's images and this one (height, width, 3 or 4), and its row."""
+        height, width, channels = image.shape
+        begin, end = self._used, self._used + height * width
+        if self._store is None or end > len(self._store):
+            # None of the images before is copied: lights have them in the array before.
+            begin, end = len(self._own.texels), len(self._own.texels) + height * width
+            self._store = np.empty((end + _SPARE_IMAGES * height * width, 4), np.float32)
+            self._store[:begin] = self._own.texels
+        self._store[begin:end, channels:] = 1.0
+        self._store[begin:end, :channels] = image.reshape(-1, channels)
+        self._used = end
+        return _with_row(self._own, self._store[:end], begin, width, height), len(self._own.begin)
+
+
+def _with_row(textures: Textures, texels: F32, begin: int, width: int, height: int) -> Textures:
+    return Textures(
+        texels=texels,
+        begin=np.append(textures.begin, begin).astype(np.int64),
+        width=np.append(textures.width, width).astype(np.int32),
+        height=np.append(textures.height, height).astype(np.int32),
+        wrap=np.concatenate([textures.wrap, np.zeros((1, 2), np.int32)]),
+    )
+
+
+def _with_row_of(textures: Textures, other: Textures, row: int) -> tuple[Textures, int]:
+    """`textures` and one row more of `other`, which begins with the same scene's; texels are copied if they must be."""
+    begin, width, height = int(other.begin[row]), int(other.width[row]), int(other.height[row])
+    texels = textures.texels
+    if len(textures.begin) == row or _same_place(texels, other.texels):
+        texels = max(texels, other.texels, key=len) if _same_place(texels, other.texels) else other.texels
+        return _with_row(textures, texels, begin, width, height), len(textures.begin)
+    return append_texture(textures, texture_image(other, row))
+
+
+def _same_place(a: F32, b: F32) -> bool:
+    return a.ctypes.data == b.ctypes.data
+
+
 def changed_light(
-    scene: SceneSnapshot,
+    images: LightImages,
     alone: SceneSnapshot,
     *,
     to_world: ArrayLike | None = None,
@@ -83,8 +136,8 @@ def changed_light(
 
     Parameters
     ----------
-    scene : SceneSnapshot
-        What `alone` was taken from; its textures stay, a new image stands behind them.
+    images : LightImages
+        Of the scene that `alone` was taken from.
     to_world : (3, 4), metres, about the scene's centre
     radiance : (3,), scene-linear
     size : (2,), local; see `scene.Lights`
@@ -117,7 +170,7 @@ def changed_light(
         if texture.size == 0:
             columns["texture"] = np.array([-1], np.int32)
         else:
-            textures, row = append_texture(scene.textures, texture)
+            textures, row = images.add(texture)
             alone = replace(alone, textures=textures)
             columns["texture"] = np.array([row], np.int32)
     return replace(alone, lights=lights._replace(**columns))
@@ -150,15 +203,8 @@ def append_texture(textures: Textures, image: F32) -> tuple[Textures, int]:
     height, width, channels = image.shape
     texels = np.ones((height * width, 4), np.float32)
     texels[:, :channels] = image.reshape(-1, channels)
-    row = len(textures.begin)
-    grown = Textures(
-        texels=np.concatenate([textures.texels, texels]),
-        begin=np.append(textures.begin, len(textures.texels)).astype(np.int64),
-        width=np.append(textures.width, width).astype(np.int32),
-        height=np.append(textures.height, height).astype(np.int32),
-        wrap=np.concatenate([textures.wrap, np.zeros((1, 2), np.int32)]),
-    )
-    return grown, row
+    every = np.concatenate([textures.texels, texels])
+    return _with_row(textures, every, len(textures.texels), width, height), len(textures.begin)
 
 
 def texture_image(textures: Textures, row: int) -> F32:
@@ -169,6 +215,7 @@ def texture_image(textures: Textures, row: int) -> F32:
 
 def new_light(
     scene: SceneSnapshot,
+    images: LightImages,
     path: str,
     kind: LightKind,
     *,
@@ -192,4 +239,4 @@ def new_light(
         triangle_instance=np.empty(0, np.int32),
     )
     alone = replace(scene, lights=row, light_paths=(path,))
-    return changed_light(scene, alone, to_world=to_world, radiance=radiance, size=size, texture=texture)
+    return changed_light(images, alone, to_world=to_world, radiance=radiance, size=size, texture=texture)

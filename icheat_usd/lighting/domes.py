@@ -8,8 +8,7 @@ import numpy as np
 
 from icheat_usd.kernels import domes as kernels
 from icheat_usd.kernels.direct import fill_analytic
-from icheat_usd.kernels.environment import dome_radiance
-from icheat_usd.lighting.change import append_texture, new_light, texture_image
+from icheat_usd.lighting.change import LightImages, append_texture, new_light, texture_image
 from icheat_usd.lighting.guide import Effort
 from icheat_usd.lighting.quick import Shadows
 from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
@@ -42,7 +41,9 @@ def white_sky(
     snapshot: SceneSnapshot, tracer: Tracer, points: SurfacePoints, seed: int, effort: Effort | None = None
 ) -> tuple[SceneSnapshot, LightSampler]:
     """The scene under an even sky, and a sampler that has learnt from where around some points it is seen."""
-    even = new_light(snapshot, "", LightKind.DOME, to_world=np.eye(3, 4), radiance=(1, 1, 1))
+    even = new_light(
+        snapshot, LightImages(snapshot.textures), "", LightKind.DOME, to_world=np.eye(3, 4), radiance=(1, 1, 1)
+    )
     return even, build_light_sampler(even, tracer, points, seed, effort)
 
 
@@ -147,12 +148,12 @@ class BinnedSky:
 
     def under(self, alone: SceneSnapshot) -> F32:
         """Mean radiance of each bin as the dome stands in `alone`, (n_bins, 3)."""
-        out = np.zeros((len(_DIRECTIONS), 3), np.float32)
+        out = np.zeros((kernels.ROWS * kernels.COLUMNS, 3), np.float32)
         linear = alone.lights.to_world[0, :, :3].astype(np.float64)
         if np.linalg.det(linear) != 0.0:
             to_local = np.ascontiguousarray(np.linalg.inv(linear))
-            dome_radiance(self._texture, self._image, alone.lights.radiance[0], to_local, _DIRECTIONS, out)
-        return out.reshape(-1, _LOOKS * _LOOKS, 3).mean(axis=1)
+            kernels.bin_sky(self._texture, self._image, alone.lights.radiance[0], to_local, _DIRECTIONS, out)
+        return out
 
 
 def _smaller(image: F32) -> F32:
@@ -176,7 +177,8 @@ def _bin_directions() -> F32:
     y = 1.0 - 2.0 * (row + v) / kernels.ROWS
     longitude = 2.0 * np.pi * ((column + u) / kernels.COLUMNS - 0.5)
     r = np.sqrt(1.0 - y * y)
-    return np.stack([r * np.sin(longitude), y, r * np.cos(longitude)], -1).reshape(-1, 3).astype(np.float32)
+    directions = np.stack([r * np.sin(longitude), y, r * np.cos(longitude)], -1)
+    return directions.reshape(-1, _LOOKS * _LOOKS, 3).astype(np.float32)
 
 
 _DIRECTIONS = _bin_directions()

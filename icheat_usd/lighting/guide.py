@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Generator
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,19 @@ _CELLS = BANDS * COLUMNS
 
 _POINTS = 1 << 15  # that vote for the leaves: more only make the tree slower to build
 _GROUPS_AT_ONCE = 128  # densities learnt together: a quarter of a million rays
+
+
+Result = TypeVar("Result")
+Steps = Generator[None, None, Result]  #: work in steps, so that others come to their turn
+
+
+def all_steps(steps: Steps[Result]) -> Result:
+    """What comes of some work, done without a pause."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast(Result, end.value)
 
 
 class Effort(NamedTuple):
@@ -69,12 +83,12 @@ def learn_guide(
     points: SurfacePoints,
     seed: int,
     effort: Effort = Effort(),  # noqa: B008 (a constant)
-) -> Guide:
+) -> Steps[Guide]:
     """Measure with pilot rays which cells of each dome's plane light the places around some points.
 
     Places are the leaves of a tree over the points, told apart by the normal's largest component as
     well. The density over a cell follows the root mean square of what it brings, which is best for
-    cells that are partly blocked, in the manner of [1]_.
+    cells that are partly blocked, in the manner of [1]_. Each step takes about a tenth of a second.
 
     Parameters
     ----------
@@ -99,17 +113,24 @@ def learn_guide(
     keys, count = np.unique(key, return_counts=True)
     begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
 
+    start = spawn_points(snapshot, points, points.normal)
+    yield
     rows = np.full((len(lights.kind), n_leaves * CLASSES), -1, np.int32)
     weights: list[F32] = []
     n_rows = 0
     for light in domes.tolist():
         square = np.zeros((len(keys), _CELLS), np.float32)
         for turn in range(effort.rays):
-            square += _pilot(snapshot, tracer, tables, light, points, begin, seed + turn) / np.float32(effort.rays)
+            for first in range(0, len(keys), _GROUPS_AT_ONCE):
+                part = begin[first : first + _GROUPS_AT_ONCE + 1]
+                found = _pilot(snapshot, tracer, tables, light, points, start, part, first, seed + turn)
+                square[first : first + len(part) - 1] += found / np.float32(effort.rays)
+                yield
         weight, useful = _weights(square, keys, textured=bool(lights.texture[light] >= 0))
         rows[light, keys[useful]] = n_rows + np.arange(len(useful), dtype=np.int32)
         weights.append(weight[useful])
         n_rows += len(useful)
+        yield
     weight = np.concatenate(weights)
     bands, columns = np.ones((max(n_rows, 1), BANDS), np.float32), np.ones((max(n_rows, 1), _CELLS), np.float32)
     accumulate_planes(weight, bands[:n_rows], columns[:n_rows])
@@ -147,37 +168,37 @@ def _pilot(
     tables: LightTables,
     light: int,
     points: SurfacePoints,
+    start: F32,
     begin: I64,
+    first: int,
     seed: int,
 ) -> F32:
-    """Squared contribution of each cell of the plane to each group of points, (n_groups, cells)."""
-    n_groups = len(begin) - 1
-    square = np.zeros((n_groups, _CELLS), np.float32)
-    start = spawn_points(snapshot, points, points.normal)
-    for first in range(0, n_groups, _GROUPS_AT_ONCE):
-        part = begin[first : first + _GROUPS_AT_ONCE + 1]
-        n = (len(part) - 1) * _CELLS
-        point, direction, value = np.zeros(n, np.int64), np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
-        fill_pilot(
-            snapshot.lights,
-            snapshot.textures,
-            tables,
-            light,
-            part,
-            first,
-            points.position,
-            points.normal,
-            points.shading_normal,
-            seed & 0xFFFFFFFF,
-            point,
-            direction,
-            value,
-        )
-        rays = np.flatnonzero(value > 0.0)
-        seen = transmittance(snapshot, tracer, start[point[rays]], direction[rays], np.inf).mean(axis=1)
-        value[:] = _spread(rays, value[rays] * seen, n)
-        square[first : first + len(part) - 1] = (value * value).reshape(-1, _CELLS)
-    return square
+    """Squared contribution of each cell of the plane to some groups of points, (n_groups, cells).
+
+    `start` (n, 3) where rays from the points start; `begin` (n_groups + 1,) of the groups, the first of which has
+    the number `first`.
+    """
+    n = (len(begin) - 1) * _CELLS
+    point, direction, value = np.zeros(n, np.int64), np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
+    fill_pilot(
+        snapshot.lights,
+        snapshot.textures,
+        tables,
+        light,
+        begin,
+        first,
+        points.position,
+        points.normal,
+        points.shading_normal,
+        seed & 0xFFFFFFFF,
+        point,
+        direction,
+        value,
+    )
+    rays = np.flatnonzero(value > 0.0)
+    seen = transmittance(snapshot, tracer, start[point[rays]], direction[rays], np.inf).mean(axis=1)
+    value[:] = _spread(rays, value[rays] * seen, n)
+    return (value * value).reshape(-1, _CELLS)
 
 
 def _spread(rows: I64, values: F32, n: int) -> F32:

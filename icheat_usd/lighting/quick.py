@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers
-from icheat_usd.kernels.shadow import light_places
+from icheat_usd.kernels.shadow import GLOSS, PART, RUN, STRIDE, light_places
 from icheat_usd.lighting.points import light_points
 from icheat_usd.materials import is_glossy
 from icheat_usd.scene import F32, I32, I64, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import build_tracer, spawn_points
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.tracing.paths import passing_materials
+
+_ALPHA = 6  # column of the tables of lobes
+_POINT_COLUMNS = [0, 1, 2, 3, 4, 5, 9]  # of the table of a light's points: place, normal, what it brings
+_CANDIDATES = 4  # points of the light that a place looks at
+_FEW_CANDIDATES = 2  # where places share rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +71,26 @@ def _tracer_of(snapshot: SceneSnapshot, kept: np.ndarray) -> EmbreeTracer:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Surface points made ready for `direct_at`."""
+    """Surface points made ready for `direct_at`, in runs; see `kernels.shadow.light_places`."""
 
     row: I32  #: (n,) point of each place
-    place: F32  #: (n, 9), see `kernels.shadow.light_places`
-    tint: F32  #: (n, 3)
-    gloss: F32  #: (n, 12), or (0, 12) where no lobe is wanted
+    place: F32  #: (n_runs, 9, RUN)
+    tint: F32  #: (n_runs, 3, RUN)
+    gloss: F32  #: (n_lobed, 12, RUN), none where no lobe is wanted
+    lobes: I32  #: (n_runs,)
+
+    @property
+    def n(self) -> int:
+        """How many there are."""
+        return len(self.row)
+
+
+class LastLook:
+    """What was between places and a light when it was last looked at; goes with one `Places`."""
+
+    def __init__(self, places: Places) -> None:
+        self.known = np.full(places.n, -1, np.int16)
+        self.n = 0  #: looks so far
 
 
 def prepare_places(
@@ -82,18 +102,27 @@ def prepare_places(
     ----------
     albedo : (n, 3), 0 for points that reflect nothing
     to_eye : (n, 3), unit; None: diffuse reflection alone
+    order : (n,), by default as the points come
     """
     place = np.concatenate([spawn_points(snapshot, points, points.normal), points.normal, points.shading_normal], 1)
     place[points.instance < 0] = 0.0
-    tint = albedo / np.float32(np.pi)
-    gloss = np.zeros((0, 12), np.float32)
-    if to_eye is not None and is_glossy(points).any():
-        gloss = _lobes(points, to_eye)
     row = np.arange(len(place), dtype=np.int32) if order is None else order.astype(np.int32)
+    n_runs = -(-len(place) // RUN)
+    gloss, lobes = np.zeros((0, GLOSS, RUN), np.float32), np.full(n_runs, -1, np.int32)
+    if to_eye is not None and is_glossy(points).any():
+        every = _runs(_lobes(points, to_eye), order)
+        lobed = every[:, _ALPHA].any(axis=1)
+        gloss, lobes[lobed] = every[lobed], np.arange(lobed.sum(), dtype=np.int32)
+    return Places(row, _runs(place, order), _runs(albedo / np.float32(np.pi), order), gloss, lobes)
+
+
+def _runs(table: F32, order: I64 | None) -> F32:
+    """Rows (n, k) of places as a table (k, RUN) for each run of them; 0 behind the last."""
     if order is not None:
-        place, tint = place[order], tint[order]
-        gloss = gloss[order] if len(gloss) else gloss
-    return Places(row, *(np.ascontiguousarray(table, np.float32) for table in (place, tint, gloss)))
+        table = table[order]
+    runs = np.zeros((-(-len(table) // RUN) * RUN, table.shape[1]), np.float32)
+    runs[: len(table)] = table
+    return np.ascontiguousarray(runs.reshape(-1, RUN, table.shape[1]).transpose(0, 2, 1))
 
 
 def _lobes(points: SurfacePoints, to_eye: F32) -> F32:
@@ -109,25 +138,84 @@ def _lobes(points: SurfacePoints, to_eye: F32) -> F32:
 
 
 def direct_at(
-    snapshot: SceneSnapshot, shadows: Shadows, places: Places, seed: int, share_rays: bool, out: F32, turn: int = 0
+    snapshot: SceneSnapshot,
+    shadows: Shadows,
+    places: Places,
+    seed: int,
+    share_rays: bool,
+    out: F32,
+    turn: int = 0,
+    last: LastLook | None = None,
 ) -> None:
     """Light of a one-light snapshot that places reflect, one shadow ray each, into `out` (n, 3) in the points' order.
 
     The mean over turns 0, 1, 2, ... converges: every turn looks at other points of the light.
     Kinds with a surface of their own and distant lights only. Surfaces that let light through dim it as for all
     shadow rays.
+
+    Parameters
+    ----------
+    last : LastLook, optional
+        Of the same light and turn somewhere near: most places take their shadow from it. It is brought up to date.
     """
     table, distant = light_points(snapshot, seed)
-    through = np.empty(len(places.place), np.int32)
+    groups = light_groups(table, _FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
+    through = np.empty(0 if shadows.passing is None else places.n, np.int32)
     function, opaque = shadows.opaque.address_of("rtcOccluded16")
     passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
-    tables = places.place, places.tint, places.gloss
-    similar = shadows.opaque.compiled().arguments if share_rays else 0
+    phase, known = -1, np.empty(0, np.int16)
+    if last is not None:
+        known = last.known
+        phase = last.n % PART if last.n else -1
+        last.n += 1
     light_places(
-        function, similar, opaque, passing, table, distant, seed, turn, *tables, share_rays, places.row, out, through
+        function,
+        shadows.opaque.compiled().arguments if share_rays else 0,
+        opaque,
+        passing,
+        groups.points,
+        groups.first,
+        groups.colors,
+        distant,
+        seed,
+        turn,
+        places.place,
+        places.tint,
+        places.gloss,
+        places.lobes,
+        share_rays,
+        phase,
+        known,
+        places.row,
+        out,
+        through,
     )
     if shadows.passing is not None:
         rows = np.flatnonzero(through)
-        origin, end = places.place[rows, :3], table[through[rows] - 1, :3]
+        origin, end = places.place[rows // RUN, :3, rows % RUN], table[through[rows] - 1, :3]
         direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
         out[places.row[rows]] *= shadows.crossing(snapshot, origin, direction, limit)[:, None]
+
+
+class LightGroups(NamedTuple):
+    """Points of a light as successive places look at them; see `kernels.shadow.light_places`."""
+
+    points: F32
+    first: I32
+    colors: F32
+
+
+def light_groups(table: F32, candidates: int, turn: int) -> LightGroups:
+    """Groups of so many points of a table of `light_points`; successive places look at different parts of the light.
+
+    In as many turns as there are groups a place looks at every point once.
+    """
+    n = len(table) // candidates
+    group = (np.arange(n + RUN) * STRIDE ^ turn) & (n - 1)
+    points = table[:, _POINT_COLUMNS].reshape(n, candidates, len(_POINT_COLUMNS))[group]
+    colors = table[:, 6:9]
+    return LightGroups(
+        np.ascontiguousarray(points.transpose(1, 2, 0)),
+        (group * candidates).astype(np.int32),
+        np.ascontiguousarray(colors if (colors != 1.0).any() else colors[:0]),
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from icheat_usd.kernels.environment import dome_columns_cdf
 from icheat_usd.kernels.guide import Guide
 from icheat_usd.kernels.lights import LightTables
-from icheat_usd.lighting.guide import Effort, learn_guide, no_guide
+from icheat_usd.lighting.guide import Effort, Steps, all_steps, learn_guide, no_guide
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, SurfacePoints, Texture
 from icheat_usd.tracing import Tracer
@@ -53,7 +53,18 @@ def build_light_sampler(
     seed: int = 0,
     effort: Effort | None = None,
 ) -> LightSampler:
-    """Prepare the sampling of every light.
+    """Prepare the sampling of every light: all of `prepare_light_sampler`."""
+    return all_steps(prepare_light_sampler(snapshot, tracer, points, seed, effort))
+
+
+def prepare_light_sampler(
+    snapshot: SceneSnapshot,
+    tracer: Tracer | None = None,
+    points: SurfacePoints | None = None,
+    seed: int = 0,
+    effort: Effort | None = None,
+) -> Steps[LightSampler]:
+    """Prepare the sampling of every light, in steps.
 
     Dome texels get a probability proportional to the luminance of the bilinear image averaged
     over the texel times its solid angle; triangles of a mesh light one proportional to world
@@ -94,7 +105,7 @@ def build_light_sampler(
     )
     guide = no_guide(n)
     if tracer is not None and points is not None:
-        guide = learn_guide(snapshot, tracer, tables, points, seed, effort or Effort())
+        guide = yield from learn_guide(snapshot, tracer, tables, points, seed, effort or Effort())
     return LightSampler(
         tables=tables,
         guide=guide,

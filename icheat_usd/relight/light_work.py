@@ -10,11 +10,17 @@ import numpy as np
 
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.rows import mean_over_segments
-from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct, samples_per_light
+from icheat_usd.lighting import (
+    build_light_sampler,
+    irradiance,
+    prepare_light_sampler,
+    reflected_direct,
+    samples_per_light,
+)
 from icheat_usd.lighting.domes import BinnedSky, SeenSky, see_sky, white_sky
-from icheat_usd.lighting.guide import LITTLE
+from icheat_usd.lighting.guide import LITTLE, Steps
 from icheat_usd.lighting.points import has_points
-from icheat_usd.lighting.quick import Places, Shadows, build_shadows, direct_at, prepare_places
+from icheat_usd.lighting.quick import LastLook, Places, Shadows, build_shadows, direct_at, prepare_places
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.samples import GatherSamples, ViewSamples
@@ -30,6 +36,8 @@ from icheat_usd.transport.sparse import SparseRows
 _SMOOTH = 0.3
 
 _RAYS_PER_STEP = 1 << 16  # of the general way
+
+_PARTS = 4  # bounces of a light that moves are found for one of so many cells at a time
 
 # Rays to the sky of each patch point and view sample, for domes on the move.
 _SKY_OF_CELLS, _SKY_OF_VIEW = 2, 8
@@ -101,11 +109,24 @@ class Surroundings:
         """Whether the light of a one-light snapshot has the quick way."""
         return self.shadows is not None and has_points(int(alone.lights.kind[0]))
 
-    def all_bounces(self, direct: F32, before: tuple[F32, F32] | None = None) -> F32:
-        """Light that leaves the cells, quickly; the closer to direct light and radiance `before`, the better."""
+    def bounce(self, direct: F32, radiance: F32, before: F32 | None, part: tuple[int, int] = (0, 1)) -> None:
+        """Bring light that leaves the cells up to date with their direct light, quickly.
+
+        Parameters
+        ----------
+        radiance : (n_gather, 3)
+            Changed. The closer to what it becomes, the better.
+        before : (n_gather, 3) or None
+            Direct light of which it came.
+        part : (int, int)
+            See `QuickBounces.follow`.
+        """
         if self.quick_bounces is None:
-            return direct
-        return self.quick_bounces.solve(direct) if before is None else self.quick_bounces.follow(*before, direct)
+            radiance[:] = direct
+        elif before is None:
+            self.quick_bounces.solve(direct, radiance)
+        else:
+            self.quick_bounces.follow(radiance, before, direct, radiance, part)
 
     def cell_means(self, of_patches: F32) -> F32:
         """Means over the patch points of each cell."""
@@ -132,7 +153,7 @@ def build_surroundings(
         patches = prepare_places(snapshot, gather.patch_points, albedo, None)
         count = np.diff(gather.cell_begin)
         chosen = np.random.default_rng(seed).integers(0, count) + gather.cell_begin[:-1]
-        cells = Places(np.arange(gather.n, dtype=np.int32), patches.place[chosen], patches.tint[chosen], patches.gloss)
+        cells = prepare_places(snapshot, take_points(gather.patch_points, chosen), albedo[chosen], None)
         tiles = prepare_places(snapshot, view.points, view.points.albedo, view.to_eye, _tile_order(view))
     return Surroundings(
         snapshot,
@@ -181,6 +202,20 @@ class ExactBounces:
         return False
 
 
+class Following:
+    """What is kept of a light from one first look to the next, while it moves."""
+
+    def __init__(self, around: Surroundings) -> None:
+        self.n = 0  #: first looks so far
+        self.cells = None if around.cells is None else LastLook(around.cells)
+        self.view = None if around.tiles is None else LastLook(around.tiles)
+
+    def next_part(self) -> tuple[int, int]:
+        """Of the cells, whose bounces are looked at this time; all of them at first."""
+        self.n += 1
+        return (0, 1) if self.n == 1 else (self.n % _PARTS, _PARTS)
+
+
 class MovingLight:
     """A light with a surface of its own, or a distant one: rounds of one shadow ray per patch point and view sample."""
 
@@ -191,18 +226,22 @@ class MovingLight:
         self._step = self._n_found = 0
         self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
+        self.following = Following(around)  #: may be set from before to spare work
         self._cells = np.zeros((around.gather.n, 3), np.float32)
         self._view = np.zeros((around.view.n, 3), np.float32)
 
     def show(self, radiance: F32, view_direct: F32) -> None:
-        """First look: a shadow ray per cell, and where neighbours disagree one per view sample."""
-        around = self._around
+        """First look: a shadow ray per cell, and where neighbours disagree one per view sample.
+
+        Near the look before, a part of these rays is enough.
+        """
+        around, last = self._around, self.following
         assert around.shadows is not None and around.cells is not None and around.tiles is not None
         direct = np.empty((around.gather.n, 3), np.float32)
-        direct_at(self._alone, around.shadows, around.cells, self._seed, False, direct)
-        radiance[:] = around.all_bounces(direct, None if self.direct is None else (radiance, self.direct))
+        direct_at(self._alone, around.shadows, around.cells, self._seed, False, direct, last=last.cells)
+        around.bounce(direct, radiance, self.direct, last.next_part())
         self.direct = direct
-        direct_at(self._alone, around.shadows, around.tiles, self._seed, True, view_direct)
+        direct_at(self._alone, around.shadows, around.tiles, self._seed, True, view_direct, last=last.view)
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """Another round at the cells or at the view; False after the last."""
@@ -218,7 +257,7 @@ class MovingLight:
             self.direct = direct
             return self._find_highlights(view_direct)
         places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
-        found = np.empty((len(places.place), 3), np.float32)
+        found = np.empty((places.n, 3), np.float32)
         direct_at(self._alone, around.shadows, places, self._seed, False, found, turn)
         into += found if at_view else around.cell_means(found)
         share = np.float32(1.0 / (turn + 1))
@@ -226,7 +265,7 @@ class MovingLight:
             np.multiply(into, share, out=view_direct)
         else:
             direct = into * share
-            radiance[:] = around.all_bounces(direct, None if self.direct is None else (radiance, self.direct))
+            around.bounce(direct, radiance, self.direct)
             self.direct = direct
         return True
 
@@ -255,12 +294,14 @@ class AnyLight:
         self._n_cells = light_samples
         self._n_view = samples_per_light(alone, light_samples, dome_samples)[0]
         self._samplers: list[LightSampler] = []
+        self._learning: Steps[LightSampler] | None = None
         self._cell = self._sample = 0
         self._exact: ExactBounces | None = None
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self._cells = np.zeros((around.gather.n, 3), np.float32)
         self._view = np.zeros((around.view.n, 3), np.float32)
+        self.following = Following(around)  #: may be set from before to spare work
 
     def show(self, radiance: F32, view_direct: F32) -> None:
         """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample."""
@@ -271,7 +312,7 @@ class AnyLight:
             sky = self.bins.under(self._alone)
             direct = np.empty((around.gather.n, 3), np.float32)
             of_cells.light(sky, direct)
-            radiance[:] = around.all_bounces(direct, None if self.direct is None else (radiance, self.direct))
+            around.bounce(direct, radiance, self.direct, self.following.next_part())
             self.direct = direct
             around.light_view(sky, view_direct)
             return
@@ -279,7 +320,7 @@ class AnyLight:
         points = take_points(around.gather.patch_points, patch)
         arriving = irradiance(self._alone, around.tracer, self._sampler(0), points, self._seed, 1)[0]
         self.direct = arriving * around.patch_tint[patch]
-        radiance[:] = around.all_bounces(self.direct)
+        around.bounce(self.direct, radiance, None)
         view_direct[:] = reflected_direct(
             self._alone, around.tracer, self._sampler(1), around.view.points, around.view.to_eye, self._seed, 1
         )[0]
@@ -288,13 +329,18 @@ class AnyLight:
         """The next part of the cells, then of the view; False after the last."""
         around = self._around
         if self._cell < around.gather.n:
-            self._light_cells()
+            if self._samplers:
+                self._light_cells()
+            else:
+                self._learn()
             return True
         self._exact = self._exact or ExactBounces(around, self._cells)
         if self._exact.step(radiance):
             return True
         self.direct = self._cells
-        if self._sample < around.view.n:
+        if self._sample < around.view.n and len(self._samplers) < 2:
+            self._learn()
+        elif self._sample < around.view.n:
             self._light_view()
         if self._sample < around.view.n:
             return True
@@ -304,10 +350,20 @@ class AnyLight:
     def _sampler(self, which: int) -> LightSampler:
         """Of the cells (0) and of the view (1), learnt when first needed."""
         while len(self._samplers) <= which:
+            self._learn()
+        return self._samplers[which]
+
+    def _learn(self) -> None:
+        """One step of learning the next sampler."""
+        if self._learning is None:
             around = self._around
             points = around.view.points if self._samplers else around.gather.patch_points
-            self._samplers.append(build_light_sampler(self._alone, around.tracer, points, self._seed))
-        return self._samplers[which]
+            self._learning = prepare_light_sampler(self._alone, around.tracer, points, self._seed)
+        try:
+            next(self._learning)
+        except StopIteration as end:
+            self._samplers.append(end.value)
+            self._learning = None
 
     def _light_cells(self) -> None:
         around, begin = self._around, self._around.gather.cell_begin

@@ -8,9 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from icheat_usd.lighting.change import LightError, changed_light, checked_numbers, join_lights, new_light, one_light
+from icheat_usd.lighting.change import (
+    LightError,
+    LightImages,
+    changed_light,
+    checked_numbers,
+    join_lights,
+    new_light,
+    one_light,
+)
 from icheat_usd.lighting.domes import BinnedSky
-from icheat_usd.relight.light_work import AnyLight, MovingLight, SparseView, Surroundings, build_surroundings
+from icheat_usd.relight.light_work import AnyLight, Following, MovingLight, SparseView, Surroundings, build_surroundings
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -24,6 +32,7 @@ class _Light:
     alone: SceneSnapshot
     work: AnyLight | MovingLight | None = None
     bins: BinnedSky | None = None  #: of a dome's image
+    following: Following | None = None  #: what is kept until it rests
     direct: F32 | None = None  #: at the cells, of which the present radiance came
     moved: int = 0  #: what `LiveLights.moves` was at its last change
 
@@ -59,7 +68,7 @@ class LiveLights:
         seed: int = 0,
         sparse: SparseView | None = None,
     ) -> None:
-        self._scene, self._seed = snapshot, seed
+        self._scene, self._seed, self._images = snapshot, seed, LightImages(snapshot.textures)
         self._light_samples, self._dome_samples = light_samples, dome_samples
         self._around: Surroundings = build_surroundings(
             snapshot, tracer, view, gather, bounces, n_bounces, seed, sparse
@@ -134,7 +143,7 @@ class LiveLights:
         """
         state = self._lights[self._checked(light)]
         state.alone = changed_light(
-            self._scene, state.alone, to_world=to_world, radiance=radiance, size=size, texture=texture
+            self._images, state.alone, to_world=to_world, radiance=radiance, size=size, texture=texture
         )
         if texture is not None:
             state.bins = None
@@ -151,7 +160,9 @@ class LiveLights:
         texture: F32 | None = None,
     ) -> int:
         """Add a light behind the others; returns its number."""
-        alone = new_light(self._scene, path, kind, to_world=to_world, radiance=radiance, size=size, texture=texture)
+        alone = new_light(
+            self._scene, self._images, path, kind, to_world=to_world, radiance=radiance, size=size, texture=texture
+        )
         self._lights.append(_Light(alone))
         self.gains = np.concatenate([self.gains, np.ones((1, 3), np.float32)])
         self.radiance = np.concatenate([self.radiance, np.zeros((1, *self.radiance.shape[1:]), np.float32)])
@@ -176,7 +187,7 @@ class LiveLights:
                 more = state.work.step(self.radiance[light], self.view_direct[light])
                 state.direct = state.work.direct
                 if not more:
-                    state.work = None
+                    state.work = state.following = None
                 self.revision += 1
                 self.moves = state.moved = self.moves + 1
                 break
@@ -201,8 +212,9 @@ class LiveLights:
         if isinstance(work, AnyLight):
             work.bins = state.bins
         work.direct = state.direct
+        work.following = state.following or work.following
         work.show(self.radiance[light], self.view_direct[light])
-        state.work, state.direct = work, work.direct
+        state.work, state.direct, state.following = work, work.direct, work.following
         state.bins = work.bins if isinstance(work, AnyLight) else None
         self.revision += 1
         self.moves = state.moved = self.moves + 1

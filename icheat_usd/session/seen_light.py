@@ -24,14 +24,14 @@ class SeenLight:
 
     def __init__(self, snapshot: SceneSnapshot, view: ViewSamples) -> None:
         self._snapshot, self._own = snapshot, view
-        self._key = _key(snapshot)
+        self._key = self._key_of(snapshot)
         self._known = self._key
         self.view = view  #: with the sky and the glow as they are now
         self.difference: F32 | None = None  #: (height, width, 3) that they add to the stage's own; None is none
 
     def update(self, now: SceneSnapshot) -> None:
         """Look at lights that may have changed."""
-        key = _key(now)
+        key = self._key_of(now)
         if key == self._known:
             return
         self._known = key
@@ -61,8 +61,13 @@ class SeenLight:
                 emission = np.where((surface == own.surface[row])[:, None], emission * factor, emission)
         return np.ascontiguousarray(emission, np.float32)
 
-
-def _key(snapshot: SceneSnapshot) -> tuple[str, ...]:
-    lights = snapshot.lights
-    seen = (LightKind.DOME, LightKind.MESH)
-    return tuple(light_digest(lights, row) for row, kind in enumerate(lights.kind) if LightKind(int(kind)) in seen)
+    def _key_of(self, now: SceneSnapshot) -> tuple[tuple[str, int], ...]:
+        """What the lights that are seen are; new images are told apart by where their texels lie, not by their row."""
+        lights, textures = now.lights, now.textures
+        found = []
+        for row in np.flatnonzero(np.isin(lights.kind, (LightKind.DOME, LightKind.MESH))).tolist():
+            image, place = int(lights.texture[row]), -1
+            if image >= len(self._snapshot.textures.begin):
+                place = textures.texels.ctypes.data + int(textures.begin[image]) * textures.texels.strides[0]
+            found.append((light_digest(lights, row), place))
+        return tuple(found)

@@ -15,7 +15,7 @@ _CLUSTERS = 1024  # at most: their matrices take 12 MB
 _FEW_CLUSTERS = 256  # whose bounces add up in some hundredths of a second
 _CELLS_PER_CLUSTER = 32  # where there are more clusters than that
 _STEPS = 2  # at most, per change
-
+_ALL = (0, 1)  # every cell
 
 _WHITE, _WHITE_COUNTS = 0.9, 8  # cells of a larger albedo stand for so many
 
@@ -49,50 +49,77 @@ class QuickBounces:
     lasting: bool  #: whether there are enough bounces for a balance
     scratch: F32  #: (2, n_gather, 4) for `solve` and `follow`, which thus serve one thread at a time
 
-    def solve(self, direct: F32) -> F32:
+    def solve(self, direct: F32, out: F32 | None = None) -> F32:
         """Approximation of `solve_bounces` for one light: (n_gather, 3) to (n_gather, 3)."""
-        light, missing = self.scratch
+        out = np.empty_like(direct) if out is None else out
+        none = np.empty((0, 3), np.float32)
+        leaves, _ = self._take_change(none, none, direct)
+        if not self.lasting:  # one bounce is what light without any lacks
+            self._step(direct, _ALL, out)
+            return out
+        self._add(leaves, None, _ALL, none)
+        return self._balance(direct, _ALL, out)
+
+    def follow(
+        self, radiance: F32, before: F32, direct: F32, out: F32 | None = None, part: tuple[int, int] = (0, 1)
+    ) -> F32:
+        """Light for direct light that has changed from `before`, of which came `radiance`; all (n_gather, 3).
+
+        Parameters
+        ----------
+        out : (n_gather, 3), optional
+            May be `radiance`.
+        part : (int, int)
+            Rows of every so-manieth cell alone are looked at, from this number on; for the others clusters stand,
+            until their number comes.
+        """
+        out = np.empty_like(direct) if out is None else out
         if not self.lasting:
-            light[:, :3] = direct
-            self._find_missing(direct)  # one bounce, as light without any is `direct`
-            self._add(missing)
-            return np.ascontiguousarray(light[:, :3])
-        light[:] = 0.0
-        missing[:, :3] = direct
-        self._add(missing)
-        return self._balance(direct)
+            return self.solve(direct, out)
+        leaves, (changed, all_of_it) = self._take_change(radiance, before, direct)
+        if changed > all_of_it:
+            return self.solve(direct, out)
+        self._add(leaves, None, _ALL, np.empty((0, 3), np.float32))
+        return self._balance(direct, part, out)
 
-    def follow(self, radiance: F32, before: F32, direct: F32) -> F32:
-        """Light for direct light that has changed from `before`, of which came `radiance`; all (n_gather, 3)."""
-        change = direct - before
-        if not self.lasting or np.abs(change).sum() > np.abs(direct).sum():
-            return self.solve(direct)
-        light, missing = self.scratch
-        light[:, :3] = radiance
-        missing[:, :3] = change
-        self._add(missing)
-        return self._balance(direct)
-
-    def _balance(self, direct: F32) -> F32:
-        light, missing = self.scratch
+    def _balance(self, direct: F32, part: tuple[int, int], out: F32) -> F32:
         for _ in range(_STEPS):
-            self._find_missing(direct)
-            self._add(missing)
-            if np.abs(missing).sum() <= _UNBALANCED * np.abs(light).sum():
+            lacking, light = self._step(direct, part, out)
+            if lacking <= _UNBALANCED * light:
                 break
-        return np.ascontiguousarray(light[:, :3])
+            part = (part[0] + part[1] // 2) % part[1], part[1]
+        return out
 
-    def _find_missing(self, direct: F32) -> None:
+    def _take_change(self, radiance: F32, before: F32, direct: F32) -> tuple[F32, F32]:
+        """Mean change of each cluster (3, n_clusters), and the sizes of all change and of all direct light."""
+        leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 2), np.float32)
+        kernels.take_change(self.begin, self.share, radiance, before, direct, self.scratch[0], leaves, sizes)
+        return leaves, sizes.sum(axis=0)
+
+    def _step(self, direct: F32, part: tuple[int, int], out: F32) -> F32:
+        """Add what is missing; sizes of it and of the light, before."""
         light, missing = self.scratch
-        kernels.find_residual(self.indptr, self.entries, self.column_bits, direct, light, self.albedo, missing)
+        leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 2), np.float32)
+        arriving = np.empty((self.n_clusters, 3), np.float32)
+        rows = self.indptr, self.entries, self.column_bits
+        kernels.find_missing(
+            self.begin, self.share, *rows, direct, light, self.albedo, *part, missing, arriving, leaves, sizes
+        )
+        self._add(leaves, arriving, part, out)
+        return np.asarray(sizes.sum(axis=0))
 
-    def _add(self, missing: F32) -> None:
-        """Add light and its later bounces, those between clusters."""
-        n_clusters = len(self.begin) - 1
-        leaves, arriving = np.empty((3, n_clusters), np.float32), np.empty((n_clusters, 3), np.float32)
-        kernels.cluster_means(self.begin, self.share, missing, leaves)
-        kernels.reach_clusters(self.blocks, leaves, arriving)
-        kernels.add_clusters(self.begin, self.albedo, missing, arriving, self.scratch[0])
+    def _add(self, leaves: F32, here: F32 | None, part: tuple[int, int], out: F32) -> None:
+        """Add the later bounces of light that leaves clusters; and what is missing, which arrives as `here` says."""
+        later = np.empty((self.n_clusters, 3), np.float32)
+        kernels.reach_clusters(self.blocks, leaves, later)
+        light, missing = self.scratch
+        here, missing = (later, missing[:0]) if here is None else (here, missing)
+        kernels.add_missing(self.begin, self.albedo, missing, here, later, *part, light, out)
+
+    @property
+    def n_clusters(self) -> int:
+        """Number of clusters."""
+        return len(self.begin) - 1
 
 
 def build_quick_bounces(

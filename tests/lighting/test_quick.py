@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
-from icheat_usd.lighting.change import changed_light, one_light
+from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
 from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
-from icheat_usd.lighting.quick import build_shadows, direct_at, prepare_places
+from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, prepare_places
+from icheat_usd.lighting.sampler import prepare_light_sampler
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import build_tracer, transmittance
@@ -120,6 +121,27 @@ def test_runs_that_share_rays_agree_with_rays_of_their_own() -> None:
     assert (np.abs(own - shared) > 1e-6).any(axis=1).mean() < 0.01
 
 
+def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
+    """Near the look before a part of the rays is enough; where the light then stays, none of what was kept is old."""
+    first = scene(LIGHTS["rect"], Material(0.5))
+    points = on_floor(first, 3000)
+    order = np.lexsort((points.position[:, 0], np.floor(points.position[:, 2] * 20)))
+    shadows, places = build_shadows(first, tracer_of(first)), prepare_places(first, points, points.albedo, None, order)
+    found, fresh = np.empty((2, 3000, 3), np.float32)
+    last, images = LastLook(places), LightImages(first.textures)
+    alone = one_light(first, 0)
+    old = []
+    for step in range(12):
+        moved = translation(0.02 * min(step, 8), 0, 0) @ np.vstack([LIGHTS["rect"].to_world, [0, 0, 0, 1]])
+        alone = changed_light(images, alone, to_world=moved[:3])
+        direct_at(alone, shadows, places, 5, False, found, last=last)
+        direct_at(alone, shadows, places, 5, False, fresh)
+        old.append((found != fresh).any(axis=1).mean())
+    assert (fresh.sum(axis=1) == 0).mean() > 0.01
+    assert old[0] == 0.0 and max(old) < 0.02
+    np.testing.assert_array_equal(found, fresh)
+
+
 def test_light_crosses_layers_as_it_does_for_all_shadow_rays() -> None:
     snapshot = scene(LIGHTS["beam"], Material(0.5))
     points = on_floor(snapshot, 2000)
@@ -145,7 +167,9 @@ def test_a_turned_dome_shines_as_the_general_sampler_says() -> None:
     seen = see_sky(even, sampler, build_shadows(plain, tracer), points, points.albedo / np.pi, eye, 64, 1)
     bins = BinnedSky(one_light(plain, 0))
     for degrees in (0, 100):
-        turned = changed_light(plain, one_light(plain, 0), to_world=rotation((0.3, 1, 0), degrees)[:3])
+        turned = changed_light(
+            LightImages(plain.textures), one_light(plain, 0), to_world=rotation((0.3, 1, 0), degrees)[:3]
+        )
         found = np.empty((200, 3), np.float32)
         seen.light(bins.under(turned), found)
         expected = reflected_direct(turned, tracer, build_light_sampler(turned), points, eye, 3, 512)[0]
@@ -157,3 +181,27 @@ def test_an_even_sky_fills_every_bin_alike() -> None:
     snapshot = make_snapshot([Mesh(quad())], lights=[Light(LightKind.DOME, (1, 2, 3), IDENTITY)])
     sky = BinnedSky(snapshot).under(snapshot)
     np.testing.assert_allclose(sky, np.broadcast_to((1, 2, 3), sky.shape))
+
+
+def test_images_of_lights_follow_one_another() -> None:
+    """A new image copies no others, and those that lights had before stay as they were."""
+    plain = scene(Light(LightKind.DOME, 1.0), Material(0.5))
+    images = LightImages(plain.textures)
+    first, row = images.add(np.full((2, 4, 3), 3.0, np.float32))
+    second, row_2 = images.add(np.full((1, 2, 4), 5.0, np.float32))
+    assert row == row_2 == len(plain.textures.begin)
+    assert second.texels.ctypes.data == first.texels.ctypes.data
+    assert second.begin[row] == first.begin[row] + 8
+    np.testing.assert_array_equal(texture_image(first, row)[..., :3], 3.0)
+    np.testing.assert_array_equal(texture_image(second, row), 5.0)
+    large, _ = images.add(np.full((32, 64, 3), 7.0, np.float32))
+    np.testing.assert_array_equal(large.texels[: len(plain.textures.texels)], plain.textures.texels)
+    np.testing.assert_array_equal(texture_image(large, row)[..., :3], 7.0)
+    np.testing.assert_array_equal(texture_image(first, row)[..., :3], 3.0)
+
+
+def test_learning_the_sky_pauses_often() -> None:
+    plain = scene(Light(LightKind.DOME, 1.0), Material(0.5))
+    points = on_floor(plain, 12000)
+    steps = prepare_light_sampler(plain, tracer_of(plain), points, 1)
+    assert sum(1 for _ in steps) > 6

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from icheat_usd.lighting import build_light_sampler, reflected_direct
-from icheat_usd.lighting.change import LightError
+from icheat_usd.lighting.change import LightError, texture_image
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import LightKind, SceneSnapshot
+from icheat_usd.session.seen_light import SeenLight
 from icheat_usd.transport import light_cells
 from tests.pipeline import Pipeline
 from tests.scenes import (
@@ -220,6 +221,28 @@ def test_a_new_image_replaces_the_old_one(scene: Pipeline) -> None:
     plain = settle(build(scene, room(RECT, SPHERE, replace(DOME, image=Image(image)))))
     np.testing.assert_array_equal(lights.view_direct[2], plain.view_direct[2])
     np.testing.assert_array_equal(lights.snapshot().lights.texture, [-1, -1, 1, -1])
+
+
+def test_two_lights_have_images_of_their_own(scene: Pipeline) -> None:
+    """The scene with the lights as they are now holds each image once, wherever the lights keep theirs."""
+    lights = build(scene, room(RECT, DOME))
+    pictures = [np.full((4, 8, 3), level, np.float32) for level in (2.0, 3.0, 5.0)]
+    for light, picture in ((1, pictures[0]), (0, pictures[1]), (1, pictures[2])):
+        lights.change(light, texture=picture)
+    now = lights.snapshot()
+    for light, picture in ((0, pictures[1]), (1, pictures[2])):
+        np.testing.assert_array_equal(texture_image(now.textures, int(now.lights.texture[light]))[..., :3], picture)
+
+
+def test_the_sky_behind_a_view_follows_every_image(scene: Pipeline) -> None:
+    away = look_at((0, 5, 0), (0, 9, 0.1), width=4, height=4)
+    snapshot = make_snapshot(cornell_meshes(), camera=away, lights=[DOME])
+    pipeline = Pipeline(snapshot, n_gather=30, bounce_rays=16)
+    lights, seen = build(pipeline), SeenLight(snapshot, pipeline.view)
+    for level in (2.0, 3.0):
+        lights.change(0, radiance=(1, 1, 1), texture=np.full((4, 8, 3), level, np.float32))
+        seen.update(lights.snapshot())
+        np.testing.assert_allclose(seen.view.background, level, rtol=1e-5)
 
 
 def test_a_camera_that_sees_no_surface_needs_no_light() -> None:

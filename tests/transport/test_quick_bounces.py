@@ -70,6 +70,25 @@ def test_light_that_follows_a_change_converges_on_the_exact_bounces(room: Pipeli
     assert error(followed) < error(quick.solve(direct)) < 0.03
 
 
+def test_bounces_of_a_part_of_the_cells_come_as_close_within_a_round(room: Pipeline) -> None:
+    """A look at every fourth cell leaves little more error than one at all, and less the more parts have been seen."""
+    direct = room.cell_light.direct[0]
+    before = direct * np.random.default_rng(0).uniform(0.8, 1.2, direct.shape).astype(np.float32)
+    exact, start = (solve_bounces(room.bounces, light[None], 40)[0] for light in (direct, before))
+    quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=32)
+    assert np.diff(quick.begin).max() > 32
+
+    def error(radiance: np.ndarray) -> float:
+        return float(np.sqrt(((radiance - exact) ** 2).sum() / (exact**2).sum()))
+
+    radiance, errors = quick.follow(start, before, direct, part=(0, 4)), []
+    for part in range(1, 5):
+        errors.append(error(radiance))
+        radiance = quick.follow(radiance, direct, direct, part=(part % 4, 4))
+    assert errors[0] < 1.5 * error(quick.follow(start, before, direct)) + 0.002
+    assert errors[3] < 0.7 * errors[0]
+
+
 def test_clusters_are_subtrees_that_cover_all_cells(room: Pipeline) -> None:
     begin = cluster_begins(room.gather.tree, 20)
     assert begin[0] == 0 and begin[-1] == room.gather.n
