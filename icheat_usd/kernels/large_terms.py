@@ -2,7 +2,8 @@
 
 Which coefficients of a tile matter depends on the light: many are there for
 lights at other places. An index and a worth tell how large a term is; the
-quanta of small ones are not read.
+quanta of small ones are not read. Light is rounded to 16 bits and products are
+summed as integers, exactly, some hundred terms at a time.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from icheat_usd.kernels.simd import (
     load,
     load_color,
     no_sum,
+    plus,
     plus_size,
     scaled,
     spread_pair,
@@ -29,10 +31,12 @@ from icheat_usd.kernels.simd import (
     store_color,
     store_colors,
     store_large,
-    widen_two,
+    widen,
 )
 
 _PARTS = 32
+_AT_ONCE = 256  # pairs of coefficients: their quanta stay in the second-level cache until they are multiplied
+_QUANTA = 2 * LANES  # bytes of a pair of coefficients
 
 
 @kernel
@@ -51,19 +55,36 @@ def _find_large(begin, end, index, worth, size, least, number):  # type: ignore[
 
 
 @kernel
-def _scale_large(count, number, index, scale, value, coefficients, even, odd, bounds):  # type: ignore[no-untyped-def]
+def _find_large_pairs(begin, end, index, worth, size, least, number):  # type: ignore[no-untyped-def]
+    """Numbers of the pairs of coefficients with a term that is `least` or more, and how many they are."""
+    count = _find_large(begin, end, index, worth, size, least, number)
+    n_pairs, last = 0, np.int32(-1)
+    for i in range(count):
+        pair = number[i] >> 1
+        number[n_pairs] = pair
+        n_pairs += pair != last
+        last = pair
+    return n_pairs
+
+
+@kernel
+def _all_pairs(begin, end, number):  # type: ignore[no-untyped-def]
+    for k in range((end - begin) >> 1):
+        number[k] = (begin >> 1) + k
+    return (end - begin) >> 1
+
+
+@kernel
+def _scale_pairs(number, index, scale, coefficients, even, odd, bounds):  # type: ignore[no-untyped-def]
     """Colours that the quanta multiply, every second one apart; largest size and sum of sizes to `bounds` (2, 4)."""
-    source, targets, quanta = address_of(coefficients), (address_of(even), address_of(odd)), address_of(value)
+    source, targets = address_of(coefficients), (address_of(even), address_of(odd))
     largest_even = largest_odd = sum_even = sum_odd = black()
     offset = 0
-    for i in range(0, count, 2):
-        k, other = np.int64(number[i]), np.int64(number[i + 1])
-        fetch(quanta + LANES * k)
-        fetch(quanta + LANES * other)
+    for i in range(len(number)):
+        k = np.uint64(2 * np.int64(number[i]))
+        other = k + np.uint64(1)
         a = scaled(load_color(source + 16 * np.int64(index[k])), scale[k])
         b = scaled(load_color(source + 16 * np.int64(index[other])), scale[other])
-        if i + 1 == count:
-            b = black()
         store_color(targets[0] + offset, a)
         store_color(targets[1] + offset, b)
         largest_even, sum_even = larger_size(largest_even, a), plus_size(sum_even, a)
@@ -74,75 +95,134 @@ def _scale_large(count, number, index, scale, value, coefficients, even, odd, bo
 
 
 @kernel
-def _multiply_large(count, number, value, pairs, steps, out):  # type: ignore[no-untyped-def]
-    """One tile times one version, in integers."""
+def _add(place, sums, step):  # type: ignore[no-untyped-def]
+    store(place, plus(load(place), as_floats(sums, step)))
+
+
+@kernel
+def _multiply_pairs(first, end, count, number, value, words, steps, sums):  # type: ignore[no-untyped-def]
+    """Add pairs ``first:end`` times words to `sums` (12, 16); what is multiplied next comes into the cache."""
     r0 = r1 = r2 = r3 = g0 = g1 = g2 = g3 = b0 = b1 = b2 = b3 = no_sum()
-    quanta, place = address_of(value), address_of(pairs)
-    for i in range(0, count, 2):
-        k, other = quanta + LANES * np.int64(number[i]), quanta + LANES * np.int64(number[i + 1])
+    base, place, last = address_of(value), address_of(words), np.uint64(count - 1)
+    for i in range(np.uint64(first), np.uint64(end)):
+        ahead = base + _QUANTA * np.int64(number[min(i + np.uint64(_AT_ONCE), last)])
+        fetch(ahead)
+        fetch(ahead + 64)
+        quanta = base + _QUANTA * np.int64(number[i])
         r, g, b = spread_pair(place), spread_pair(place + 4), spread_pair(place + 8)
-        x = widen_two(k, other)
+        x = widen(quanta)
         r0, g0, b0 = add_dot(x, r, r0), add_dot(x, g, g0), add_dot(x, b, b0)
-        x = widen_two(k + 16, other + 16)
+        x = widen(quanta + 32)
         r1, g1, b1 = add_dot(x, r, r1), add_dot(x, g, g1), add_dot(x, b, b1)
-        x = widen_two(k + 32, other + 32)
+        x = widen(quanta + 64)
         r2, g2, b2 = add_dot(x, r, r2), add_dot(x, g, g2), add_dot(x, b, b2)
-        x = widen_two(k + 48, other + 48)
+        x = widen(quanta + 96)
         r3, g3, b3 = add_dot(x, r, r3), add_dot(x, g, g3), add_dot(x, b, b3)
         place += 16
     r, g, b = steps[0], steps[1], steps[2]
-    place = address_of(out)
-    store_colors(place, as_floats(r0, r), as_floats(g0, g), as_floats(b0, b))
-    store_colors(place + 256, as_floats(r1, r), as_floats(g1, g), as_floats(b1, b))
-    store_colors(place + 512, as_floats(r2, r), as_floats(g2, g), as_floats(b2, b))
-    store_colors(place + 768, as_floats(r3, r), as_floats(g3, g), as_floats(b3, b))
+    place = address_of(sums)
+    _add(place, r0, r)
+    _add(place + 64, r1, r)
+    _add(place + 128, r2, r)
+    _add(place + 192, r3, r)
+    _add(place + 256, g0, g)
+    _add(place + 320, g1, g)
+    _add(place + 384, g2, g)
+    _add(place + 448, g3, g)
+    _add(place + 512, b0, b)
+    _add(place + 576, b1, b)
+    _add(place + 640, b2, b)
+    _add(place + 704, b3, b)
+
+
+@kernel
+def _multiply_tile(count, number, index, scale, value, coefficients, room, out):  # type: ignore[no-untyped-def]
+    """Some pairs of coefficients of one tile times one version; `room` (3 _AT_ONCE + 67, 4) is work space."""
+    n = _AT_ONCE + 4  # `round_pairs` works in whole vectors
+    even, odd, words = room[:n], room[n : 2 * n], room[2 * n : 3 * n]
+    bounds, steps, per_step = room[3 * n : 3 * n + 2], room[3 * n + 2], room[3 * n + 3 : 3 * n + 7].reshape(16)
+    sums = room[3 * n + 7 : 3 * n + 55]
+    sums[:] = np.float32(0)
+    for first in range(0, count, _AT_ONCE):
+        end = min(count, first + _AT_ONCE)
+        _scale_pairs(number[first:end], index, scale, coefficients, even, odd, bounds)
+        choose_steps(2 * (end - first), bounds, steps, per_step)
+        round_pairs(end - first, even, odd, per_step, words)
+        _multiply_pairs(first, end, count, number, value, words, steps, sums)
+    place, target = address_of(sums), address_of(out)
+    for k in range(4):
+        store_colors(target + 256 * k, load(place + 64 * k), load(place + 256 + 64 * k), load(place + 512 + 64 * k))
 
 
 @kernel
 def _multiply_run(  # type: ignore[no-untyped-def]
-    tile_begin, index, scale, worth, value, coefficients, size, least, pair_tile, pair_version, first, last, out
+    tile_begin, index, scale, worth, value, coefficients, size, least, job_tile, job_version, job_out, first, last, out
 ):
-    """Pairs `first` to `last`."""
+    """Jobs `first` to `last`."""
     most = 0
-    for p in range(first, last):
-        most = max(most, tile_begin[pair_tile[p] + 1] - tile_begin[pair_tile[p]])
+    for job in range(first, last):
+        most = max(most, tile_begin[job_tile[job] + 1] - tile_begin[job_tile[job]])
     number = np.empty(most + 18, np.int32)
-    room = most // 2 + 5  # `round_pairs` works in whole vectors
-    space = np.empty((3 * room + 7, 4), np.float32)
-    even, odd, pairs = space[:room], space[room : 2 * room], space[2 * room : 3 * room]
-    bounds, steps, per_step = space[3 * room : 3 * room + 2], space[3 * room + 2], space[3 * room + 3 :].reshape(16)
-    for p in range(first, last):
-        version = pair_version[p]
-        begin, end = tile_begin[pair_tile[p]], tile_begin[pair_tile[p] + 1]
-        count = _find_large(begin, end, index, worth, size[version], least[version], number)
-        if count % 2:
-            number[count] = number[count - 1]  # counts nothing
-        _scale_large(count, number, index, scale, value, coefficients[version], even, odd, bounds)
-        choose_steps(count, bounds, steps, per_step)
-        round_pairs((count + 1) // 2, even, odd, per_step, pairs)
-        _multiply_large(count, number, value, pairs, steps, out[p])
+    room = np.empty((3 * _AT_ONCE + 67, 4), np.float32)  # one allocation: six cost as much as a tile
+    for job in range(first, last):
+        version = job_version[job]
+        begin, end = tile_begin[job_tile[job]], tile_begin[job_tile[job] + 1]
+        if len(least) > 0:
+            count = _find_large_pairs(begin, end, index, worth, size[version], least[version], number)
+        else:
+            count = _all_pairs(begin, end, number)
+        _multiply_tile(count, number, index, scale, value, coefficients[version], room, out[job_out[job]])
 
 
 @parallel_kernel
-def multiply_large_terms(  # type: ignore[no-untyped-def]
-    tile_begin, index, scale, worth, value, coefficients, size, least, pair_tile, pair_version, out
+def multiply_terms(  # type: ignore[no-untyped-def]
+    tile_begin, index, scale, worth, value, coefficients, size, least, job_tile, job_version, job_out, out
 ):
-    """`multiply_paired_tiles` without small terms, from tiles as `multiply_tiles` takes them.
+    """Rows of tiles times versions of the light, of all terms or of large ones.
 
     Parameters
     ----------
-    worth : (n,) float32
-        What a coefficient counts.
+    tile_begin, index, scale, worth, value
+        As in `PairedTiles`.
+    coefficients : (n_versions, m, 4) float32
+        Colour of each Haar coefficient and a pad.
     size : (n_versions, m) float32
         Largest size of each coefficient's channels.
     least : (n_versions,) float32
-        Terms ``worth * size`` below are left out; 0 leaves out none.
+        Terms ``worth * size`` below are left out, but where they stand beside a larger one; empty leaves out none.
+    job_tile, job_version, job_out : (n,) int32
+        What to multiply with what, and where it goes.
+    out : (n_out, 64, 4) float32
+        Products; the pad is 0.
+
+    Notes
+    -----
+    Rounding moves a product by at most half a step for each coefficient, the
+    step being the largest |scale * coefficient| of some hundred and the channel / 32767
+    (or slightly more, where 32 bits could overflow): small against the half
+    quantum that the transport was rounded by. Sums run in the order of a
+    tile's coefficients, so a product has the same bits whatever other jobs or threads there are.
     """
-    cost_end = sum_costs(tile_begin, pair_tile)
-    for part in prange(_PARTS):
+    cost_end = sum_costs(tile_begin, job_tile)
+    for turn in prange(_PARTS):
+        # Threads take turns from left to right: what is lit may lie on one side of the image.
+        part = 2 * turn % _PARTS + 2 * turn // _PARTS
         first, last = share(cost_end, part), share(cost_end, part + 1)
         _multiply_run(
-            tile_begin, index, scale, worth, value, coefficients, size, least, pair_tile, pair_version, first, last, out
+            tile_begin,
+            index,
+            scale,
+            worth,
+            value,
+            coefficients,
+            size,
+            least,
+            job_tile,
+            job_version,
+            job_out,
+            first,
+            last,
+            out,
         )
 
 

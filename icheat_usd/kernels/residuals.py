@@ -55,30 +55,104 @@ def add_light_residuals(lost, factors, n_tiles, out):  # type: ignore[no-untyped
 
 
 @kernel
-def _proportion(now, before, factor):  # type: ignore[no-untyped-def]
-    for c in range(3):
-        both, size = 0.0, 0.0
-        for k in range(len(now)):
-            both += np.float64(now[k, c]) * np.float64(before[k, c])
-            size += np.float64(before[k, c]) * np.float64(before[k, c])
-        value = np.float32(both / size) if size > 0.0 else np.float32(0.0)
-        for i in range(16):
-            factor[4 * i + c] = value
+def _piece_products(now, before, out):  # type: ignore[no-untyped-def]
+    """Sums over cells of ``now * before`` and ``before * before``, channel by channel, to `out` (6,)."""
+    r = g = b = rr = gg = bb = 0.0
+    for k in range(len(now)):
+        x, y, z = np.float64(before[k, 0]), np.float64(before[k, 1]), np.float64(before[k, 2])
+        r += np.float64(now[k, 0]) * x
+        g += np.float64(now[k, 1]) * y
+        b += np.float64(now[k, 2]) * z
+        rr += x * x
+        gg += y * y
+        bb += z * z
+    out[0], out[1], out[2], out[3], out[4], out[5] = r, g, b, rr, gg, bb
+
+
+@kernel
+def _take_proportional(now, before, factor, rest):  # type: ignore[no-untyped-def]
+    for k in range(len(now)):
+        for c in range(3):
+            rest[k, c] = now[k, c] - factor[c] * before[k, c]
 
 
 @parallel_kernel
-def proportions(versions, cell_begin, now, before, factors):  # type: ignore[no-untyped-def]
-    """The factors, channel by channel, that bring the values of some versions nearest to what they are now.
+def _find_products(pieces, now, before, sums):  # type: ignore[no-untyped-def]
+    for p in prange(len(pieces)):
+        some = slice(pieces[p, 1], pieces[p, 2])
+        _piece_products(now[some], before[some], sums[p])
+
+
+@parallel_kernel
+def _find_rest(pieces, now, before, factors, rest):  # type: ignore[no-untyped-def]
+    for p in prange(len(pieces)):
+        some = slice(pieces[p, 1], pieces[p, 2])
+        _take_proportional(now[some], before[some], factors[pieces[p, 0]], rest[some])
+
+
+def proportions(pieces, now, before, factors, rest):  # type: ignore[no-untyped-def]
+    """The factors, channel by channel, that bring earlier values nearest to what they are now, and what is left.
 
     Parameters
     ----------
-    cell_begin : (n_versions + 1,) ranges of `now` and `before` (n_cells, 3)
-    factors : (n_versions, 64) float32
-        Receives a colour and pad, 16 times.
+    pieces : (n, 3) int64
+        Number of a function, and a range of its cells; those of one function in any number of pieces.
+    now, before : (n_cells, 3) float32
+    factors : (n_functions, 64) float32
+        Receives a colour and pad, 16 times, of those that have pieces.
+    rest : (n_cells, 3) float32
+        Receives ``now - factor * before``.
     """
-    for k in prange(len(versions)):
-        v = versions[k]
-        _proportion(now[cell_begin[v] : cell_begin[v + 1]], before[cell_begin[v] : cell_begin[v + 1]], factors[v])
+    sums = np.empty((len(pieces), 6))
+    _find_products(pieces, now, before, sums)
+    total = np.zeros((len(factors), 6))
+    np.add.at(total, pieces[:, 0], sums)
+    both, size = total[:, :3], total[:, 3:]
+    found = np.divide(both, size, out=np.zeros_like(both), where=size > 0)
+    some = np.unique(pieces[:, 0])
+    factors[some] = np.tile(np.pad(found[some], ((0, 0), (0, 1))), (1, 16))
+    _find_rest(pieces, now, before, factors, rest)
+
+
+@kernel
+def _squares_run(first, end, versions, sizes, out):  # type: ignore[no-untyped-def]
+    out[first:end] = np.float32(0)
+    for v in versions:
+        for k in range(first, end):
+            out[k] += sizes[v, k] * sizes[v, k]
+
+
+@parallel_kernel
+def sum_squares(versions, sizes, out):  # type: ignore[no-untyped-def]
+    """Sums over some versions of squared sizes (n_versions, n), to `out` (n,)."""
+    n = len(out)
+    for job in prange((n + 2047) // 2048):
+        _squares_run(2048 * job, min(n, 2048 * job + 2048), versions, sizes, out)
+
+
+@kernel
+def _weighted_square(colors, weight):  # type: ignore[no-untyped-def]
+    total = np.float32(0)
+    for r in range(len(weight)):
+        for c in range(3):
+            total += weight[r] * colors[4 * r + c] * colors[4 * r + c]
+    return total
+
+
+@parallel_kernel
+def squares_of_tiles(products, weight, out):  # type: ignore[no-untyped-def]
+    """Sums over the rows of each tile of squared products times a weight.
+
+    Parameters
+    ----------
+    products : (n_lobes, at least n_tiles, 256) float32
+        64 colours and pads.
+    weight : (n_lobes, n_tiles, 64) float32
+    out : (n_lobes * n_tiles,) float64
+    """
+    n = weight.shape[1]
+    for job in prange(len(out)):
+        out[job] = _weighted_square(products[job // n, job % n], weight[job // n, job % n])
 
 
 @parallel_kernel

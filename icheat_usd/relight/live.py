@@ -259,19 +259,19 @@ class LiveRelighter:
     def refine(self) -> bool:
         """At rest: bring lights to their final quality, then take back what packing lost; False when nothing is left.
 
-        What is reached then depends on lights and stack alone. From then on frames keep to the part of the
-        transport that matters to these lights and edits, until a light is changed by more than its gain. What
-        that loses is added back: the unedited light stays that of the exact rows under all gains, and each
-        version of it while the difference that its edits make is a multiple of what it was. Where it is not, the
-        rest of it (orthogonal to what it was) is as the narrowed rows have it; versions that are new, or whose
-        casters were painted, have all of the rows.
+        What is reached then depends on lights and stack alone. From then on the unedited light of every light that
+        stays where it is follows from its exact product, under all gains; of one that moves, so does what it has in
+        common with what it was. Edited light is taken from its exact products in the same way: only what it does not
+        have in common with what it was is multiplied, at rest with the part of the packed rows that matters to these
+        lights and edits. Versions that are new, or whose casters were painted, are multiplied as a whole.
         """
         if self.lights.refine():
             return True
         self._update()
         if self._exact_products is not None and self._narrow is not None:
             if self._narrow.step(self.lights.radiance, self.lights.gains, self._versions.n):
-                self._versions.forget_residuals()
+                self._versions.forget_products()
+                self._versions.update()
                 return True
             if self._versions.refine(self._exact_products):
                 return True
@@ -442,8 +442,8 @@ class LiveRelighter:
             return
         if self._light_stale:
             self._by_group = self._light_by_group()
-            if self._narrow is not None and self._narrow.is_ready:
-                self._shared.set_unedited_at_rest(self._light(), self._narrow, self.lights.gains)
+            if self._narrow is not None:
+                self._shared.set_unedited_near_rest(self._narrow, self.lights.radiance, self.lights.gains)
             else:
                 self._shared.set_unedited(self._light())
             self._n_exact = 0
@@ -480,7 +480,6 @@ class LiveRelighter:
         if moved is None or moved != self._moves_seen:
             if self._narrow is not None:
                 self._narrow.forget()
-            self._versions.forget_residuals()
         self._moves_seen = moved
 
     def _light_paths(self) -> tuple[str, ...]:

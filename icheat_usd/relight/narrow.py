@@ -1,77 +1,131 @@
-"""Products with lights at rest: of the transport only what matters to them, and what that loses of each of them."""
+"""Products with lights of which some were at rest: these exact, and of the transport only what the others need."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from icheat_usd.kernels.residuals import add_light_residuals
+from icheat_usd.kernels.residuals import add_light_residuals, proportions
 from icheat_usd.relight.products import Products
-from icheat_usd.scene import F32
+from icheat_usd.scene import F32, I64, Bool
 from icheat_usd.transport.packed import LANES
 
-#: Memory of the narrowed tiles: two cores read it in a millisecond or two.
-NARROW_BYTES = 20_000_000
+#: Memory of the narrowed tiles: two cores read it in some tenths of a millisecond.
+NARROW_BYTES = 6_000_000
+#: Cells of a light that are compared in one piece.
+_PIECE = 2048
 
 
 class Narrow:
-    """Makes `Products` narrow for some lights, in steps, and keeps the residual of each light.
+    """Keeps the exact product of each light that was at rest, and makes `Products` narrow for lights at rest.
 
-    A narrowed product plus the residuals times the lights' gains equals the product
-    with the exact rows, whatever the gains, but for the rounding of light to 16 bits.
+    Products are linear in the light. A light that is as it was at rest needs no
+    product, whatever its gain; of one that moves, what is like it was is taken
+    from its exact product, channel by channel, and only the rest is multiplied.
+    Edited light is multiplied with narrowed rows while all lights rest.
     """
 
     def __init__(self, products: Products, exact: Products) -> None:
         self._products, self._exact = products, exact
-        self._known: list[F32] = []  # exact products of the first lights
-        self._n_tiles = 0  # that the last of these has
+        self._radiance: list[F32] = []  # that the first lights had at rest, (n_gather, 3)
+        self._known: F32 = np.zeros((0, len(exact.names) * exact.n_tiles, 4 * LANES), np.float32)  # their products
+        self._is_same: Bool | None = None  # which lights still have that; None: to be found
+        self._learnt: F32 | None = None  # of the light that is being multiplied: its first tiles
+        self._n_tiles = 0  # how many of them there are
         self._n_versions = -1  # that the products are narrow for
-        self._lost: F32 | None = None  # (n_lights, n_lobes * n_tiles, 256)
-        self._n_lost = 0  # lights that this is known of
+        self._is_asked = False  # whether versions had a chance to tell what they need
 
     @property
     def is_ready(self) -> bool:
-        """Whether `add` can be used."""
-        return self._lost is not None and self._n_lost == len(self._lost)
+        """Whether the products of all lights are known and rows are narrowed for them."""
+        return self._products.is_narrow and self._is_same is not None and bool(self._is_same.all())
 
     def forget(self) -> None:
-        """The lights are others now."""
-        self._known, self._lost = [], None
+        """Lights may be others now."""
+        self._is_same, self._learnt = None, None
         self._products.widen()
 
     def step(self, radiance: F32, gains: F32, n_versions: int) -> bool:
         """Do a part of the work, for lights (n_lights, n_gather, 3); False when nothing is left.
 
         Products are narrow for the lights and for the first versions of the edited light. A step is a part of one
-        light's exact product, the choice of the rows, or one light's residual.
+        light's exact product, or the choice of the rows.
         """
-        if self.is_ready and n_versions == self._n_versions:
+        is_same = self._compare(radiance)
+        if not is_same.all():
+            self._learn(radiance, int(np.argmin(is_same)))
+            return True
+        if self._products.is_narrow and n_versions == self._n_versions:
             return False
-        exact, products = self._exact, self._products
-        if len(self._known) < len(radiance) or (self._known and self._n_tiles < exact.n_tiles):
-            if not self._known or self._n_tiles == exact.n_tiles:
-                self._known.append(exact.room(exact.n_tiles))
-                self._n_tiles = 0
-            self._n_tiles = exact.multiply_more(radiance[len(self._known) - 1], self._n_tiles, self._known[-1])
-        elif self._lost is None or n_versions != self._n_versions:
-            lights = radiance * np.maximum(gains, np.float32(1))[:, None]
-            products.narrow(lights, n_versions, NARROW_BYTES)
-            self._n_versions, self._n_lost = n_versions, 0
-            self._lost = np.empty((len(radiance), len(exact.names) * exact.n_tiles, 4 * LANES), np.float32)
-        else:
-            near = exact.room(exact.n_tiles)
-            products.multiply_all(radiance[self._n_lost], near, narrow=True)
-            self._lost[self._n_lost] = (self._known[self._n_lost] - near).reshape(-1, 4 * LANES)
-            self._n_lost += 1
+        if not self._is_asked:
+            self._is_asked = True
+            return True
+        lights = radiance * np.maximum(gains, np.float32(1))[:, None]
+        self._products.narrow(lights, n_versions, NARROW_BYTES)
+        self._n_versions, self._is_asked = n_versions, False
         return True
 
     def versions_changed(self) -> None:
         """Other edits are shown; `step` chooses anew what matters to them."""
         self._n_versions = -1
 
-    def add(self, gains: F32, out: F32) -> None:
-        """Add what lights under gains lose to products (n_lobes, at least n_tiles, 64, 4)."""
-        assert self._lost is not None and self.is_ready
-        colors = np.concatenate([gains, np.zeros((len(gains), 1), np.float32)], axis=1)
-        factors = np.tile(colors.astype(np.float32), (1, 16))
-        flat = out.reshape(len(out), out.shape[1], 4 * LANES)
-        add_light_residuals(self._lost, factors, self._exact.n_tiles, flat)
+    def unedited(self, radiance: F32, gains: F32, out: F32) -> None:
+        """Products of lights (n_lights, n_gather, 3) under gains into ``out[:, : n_tiles]``."""
+        is_same = self._compare(radiance)
+        factors = np.zeros((len(self._known), 4 * 16), np.float32)
+        n = min(len(radiance), len(factors))
+        factors[:n] = np.tile(np.pad(gains[:n], ((0, 0), (0, 1))), (1, 16))
+        rest = np.zeros(radiance.shape[1:], np.float32)
+        for light in np.flatnonzero(~is_same).tolist():
+            rest += self._rest(light, radiance[light], factors) * gains[light]
+
+        def add(products: F32) -> None:
+            flat = products.reshape(*products.shape[:2], 4 * LANES)
+            add_light_residuals(self._known, factors, self._exact.n_tiles, flat)
+
+        if is_same.all() and len(is_same):
+            out[:, : self._exact.n_tiles] = 0
+            add(out)
+        else:
+            self._products.multiply_all(rest, out, known=add)
+
+    def _rest(self, light: int, radiance: F32, factors: F32) -> F32:
+        """What of a light is not like it was at rest; what is goes to `factors`."""
+        if light >= len(factors):
+            return radiance
+        begin = np.arange(0, len(radiance), _PIECE)
+        pieces: I64 = np.stack([0 * begin, begin, np.minimum(begin + _PIECE, len(radiance))], axis=1)
+        share, rest = np.zeros((1, 4 * 16), np.float32), np.empty_like(radiance)
+        proportions(pieces, radiance, self._radiance[light], share, rest)
+        factors[light] *= share[0]
+        return rest
+
+    def _compare(self, radiance: F32) -> Bool:
+        """Which lights are as they were when they were multiplied with the exact rows."""
+        if self._is_same is None or len(self._is_same) != len(radiance):
+            known = [*self._radiance, *[None] * (len(radiance) - len(self._radiance))]
+            pairs = zip(radiance, known, strict=False)
+            self._is_same = np.array([was is not None and np.array_equal(now, was) for now, was in pairs], np.bool_)
+        return self._is_same
+
+    def _learn(self, radiance: F32, light: int) -> None:
+        """Multiply some more tiles of exact rows with one light."""
+        exact = self._exact
+        if self._learnt is None:
+            self._learnt, self._n_tiles = exact.room(exact.n_tiles), 0
+        if self._n_tiles < exact.n_tiles:
+            self._n_tiles = exact.multiply_more(radiance[light], self._n_tiles, self._learnt)
+        if self._n_tiles < exact.n_tiles:
+            return
+        if len(self._radiance) > len(radiance):
+            del self._radiance[len(radiance) :]
+        if light >= len(self._radiance):
+            missing = light + 1 - len(self._radiance)
+            self._radiance += [np.zeros_like(radiance[light])] * missing
+        grown = np.zeros((len(self._radiance), *self._known.shape[1:]), np.float32)
+        n = min(len(grown), len(self._known))
+        grown[:n] = self._known[:n]
+        grown[light] = self._learnt.reshape(-1, 4 * LANES)
+        self._radiance[light], self._known = radiance[light].copy(), grown
+        self._learnt = None
+        assert self._is_same is not None
+        self._is_same[light] = True

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icheat_usd.kernels import versions as kernels
-from icheat_usd.kernels.large_terms import multiply_large_terms
-from icheat_usd.kernels.packed import PairedTiles, multiply_paired_tiles, pair_coefficients
-from icheat_usd.kernels.residuals import largest_channels
+from icheat_usd.kernels.large_terms import multiply_terms
+from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
+from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles, sum_squares
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
-from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
+from icheat_usd.scene import F32, F64, I32, I64, U8
 from icheat_usd.transport import SparseRows, Transport
 from icheat_usd.transport.packed import LANES, LargeTerms, PackedRows, PackedTransport
 
 #: Versions with more cells than this are transformed as a whole, by all cores.
 _MANY_CELLS = 4096
-#: Quanta that are read of a large transport for light not seen before: a quarter of them loses little beside packing.
+#: Of a transport of more bytes than this, terms that are small in the light at hand are left out of its products.
+SMALL_BYTES = 8_000_000
+#: What is left out is expected to be off by as much of the image if its terms have random signs. They do not quite:
+#: measured with training lights, it adds up to one to four times as much.
+LEFT_OUT = 0.003
+#: More than this is not read for light not seen before, whatever is left out.
 MOVING_BYTES = 80_000_000
+#: A frame that turns out darker than this share of the last one is multiplied again, to the error that it allows.
+_DARKER = 0.5
 #: Entries of uncompressed rows that are multiplied in one step of a refinement: some hundredths of a second.
 _ENTRIES_AT_ONCE = 5_000_000
 #: Versions that are transformed at once.
@@ -44,15 +51,33 @@ class VersionTables(NamedTuple):
     restrict: I64  #: (n_versions, 4) see `kernels.versions.version_deltas`
 
 
-class _Rows:
-    """Rows of one lobe, and as kernels read them if they are quantised."""
+class _Tiles:
+    """Packed rows of all lobes as kernels read them."""
 
-    def __init__(self, rows: Any) -> None:
-        self.rows = rows
-        self.paired: PairedTiles | None = None
-        if isinstance(rows, PackedRows) and rows.value.dtype == np.int8:
-            quanta = cast(NDArray[np.int8], rows.value)
-            self.paired = pair_coefficients(rows.tile_begin, rows.index, rows.scale, quanta)
+    def __init__(self, rows: list[PackedRows]) -> None:
+        parts = [
+            pair_coefficients(of_lobe.tile_begin, of_lobe.index, of_lobe.scale, of_lobe.worth, of_lobe.value)  # type: ignore[arg-type]
+            for of_lobe in rows
+        ]
+        self.n_tiles = rows[0].n_tiles
+        self.n_lobes = len(rows)
+        self._tiles: PairedTiles = join_tiles(parts)
+
+    def multiply(self, versions: F32, size: F32, least: F32, tile: I32, version: I32, place: I64, out: F32) -> None:
+        """Products of pairs of tile and version, to ``out[:, place]`` (n_lobes, n, 64, 4); `least` may be empty."""
+        assert out.flags.c_contiguous  # a copy would be written to, and lost
+        lobe = np.repeat(np.arange(self.n_lobes), len(tile))
+        several = (self.n_lobes,)
+        multiply_terms(
+            *self._tiles,
+            versions,
+            size,
+            least,
+            (np.tile(tile, several) + self.n_tiles * lobe).astype(np.int32),
+            np.tile(version, several),
+            (np.tile(place, several) + out.shape[1] * lobe).astype(np.int32),
+            out.reshape(-1, LANES, 4),
+        )
 
 
 class Products:
@@ -68,8 +93,12 @@ class Products:
         self.names = tuple(lobe.name for lobe in lobes)
         self._haar = isinstance(transport, PackedTransport)
         self._packed = replace(transport, lobes=tuple(lobes)) if isinstance(transport, PackedTransport) else None
-        self._rows: list[_Rows] = [_Rows(lobe.rows) for lobe in lobes]
-        self._narrow: list[_Rows] | None = None
+        self._rows: list[Any] = [lobe.rows for lobe in lobes]
+        is_quantised = bool(lobes) and all(
+            isinstance(rows, PackedRows) and rows.value.dtype == np.int8 for rows in self._rows
+        )
+        self._tiles = _Tiles(self._rows) if is_quantised else None
+        self._narrow: _Tiles | None = None
         self._n_leaves = tree.n_leaves
         self._tree = tree
         n_view = len(transport.lobes[0].tint)
@@ -82,14 +111,14 @@ class Products:
         self.n_tiles = -(-(n_view if spread is None else spread.n_columns) // LANES)
         self._versions: F32 = np.zeros((0, self._n_leaves, 4), np.float32)
         self._sizes: F32 = np.zeros((0, self._n_leaves), np.float32)  # largest channels of the versions
-        self._is_small: Bool = np.zeros(0, np.bool_)  # versions that are 0 nearly everywhere
         if self._haar:
             self._parent_of_leaf, self._parent = _parents(tree)
             self._share, self._root = _shares(tree)
             self._plan = plan_haar(tree)
-            self._large_terms = (
-                None if self._packed is None or self._packed.n_bytes < 2 * MOVING_BYTES else LargeTerms(self._packed)
-            )
+            is_large = self._packed is not None and self._tiles is not None and self._packed.n_bytes > SMALL_BYTES
+            self._large_terms = LargeTerms(self._packed) if is_large and self._packed is not None else None
+            self._counts = self._weights_of_rows() if is_large else np.zeros((0, 0, LANES), np.float32)
+            self._shown = 0.0  # sum over pixels of the squared unedited light that was multiplied last
             self._leaves: F32 = np.zeros((_TOGETHER, self._n_leaves, 3), np.float32)
             self._unedited: F32 = np.zeros((1, self._n_leaves, 4), np.float32)
 
@@ -108,7 +137,7 @@ class Products:
         sizes = np.abs(self._versions[:n_versions]).max(axis=(0, 2), initial=0.0)
         for light in lights:
             np.maximum(sizes, np.abs(haar_of_versions(self._plan, light[None])).max(axis=(0, 2)), out=sizes)
-        self._narrow = [_Rows(lobe.rows) for lobe in self._packed.narrowed(sizes, max_bytes).lobes]
+        self._narrow = _Tiles([lobe.rows for lobe in self._packed.narrowed(sizes, max_bytes).lobes])
 
     def widen(self) -> None:
         """Forget the narrowed rows."""
@@ -121,7 +150,7 @@ class Products:
     def keep(self, versions: I64) -> None:
         """Forget all but some versions (ascending), and number these anew, in their order."""
         n = len(versions)
-        for values in (self._versions, self._sizes, self._is_small):
+        for values in (self._versions, self._sizes):
             for new, old in enumerate(versions):
                 values[new] = values[old]
         self._versions[n:] = 0
@@ -135,7 +164,6 @@ class Products:
             sizes = np.zeros(grown.shape[:2], np.float32)
             sizes[: len(self._sizes)] = self._sizes
             self._sizes = sizes
-            self._is_small = np.append(self._is_small, np.zeros(len(grown) - len(self._is_small), np.bool_))
 
     def nodes(self, cells: I32) -> tuple[I32, I32]:
         """Nodes of the tree above some cells and their children; nothing where no wavelets are needed."""
@@ -173,36 +201,44 @@ class Products:
             values = self._leaves[: len(some)]
             kernels.fill_versions(some, tables.cell_begin, tables.cells, deltas, values)
             haar_of_versions(self._plan, values, self._versions, some)
-        self._is_small[versions] = ~large
-        largest_channels(versions[~large], self._versions, self._sizes)
+        largest_channels(versions, self._versions, self._sizes)
+        self._sizes[versions, 0] = np.inf  # means stay, however dark they are
 
     def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:
-        """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows."""
-        small = self._is_small[pair_version[pairs]]
-        for some, is_small in ((pairs[small], True), (pairs[~small], False)):
-            if len(some):
-                self._multiply_some(some, pair_tile, pair_version, out, narrow, is_small)
+        """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows.
 
-    def _multiply_some(
-        self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool, small: bool
-    ) -> None:
+        Of a large transport, only the terms are read that are large in these versions together, seen beside the
+        unedited light; see `LEFT_OUT`.
+        """
+        if not len(pairs):
+            return
         tile, version = pair_tile[pairs], pair_version[pairs]
-        least = np.full(len(self._versions) if small else 0, np.finfo(np.float32).tiny, np.float32)
-        direct = len(pairs) == pairs[-1] - pairs[0] + 1 and bool((np.diff(pairs) == 1).all())
-        part = slice(pairs[0], pairs[-1] + 1)
-        for lobe in range(len(self._rows)):
-            into = out[lobe, part] if direct else np.empty((len(pairs), LANES, 4), np.float32)
-            self._multiply(lobe, self._versions, tile, version, into, narrow, self._sizes, least)
-            if not direct:
+        tiles = self._narrow if narrow else self._tiles
+        if tiles is None:
+            for lobe, rows in enumerate(self._rows):
+                into = np.empty((len(pairs), LANES, 4), np.float32)
+                self._multiply_floats(rows, self._versions, tile, version, into)
                 out[lobe, pairs] = into
+            return
+        least = np.full(len(self._versions), np.finfo(np.float32).tiny, np.float32)
+        if self._large_terms is not None and not narrow:
+            least[:] = max(self._least_of(np.unique(version)), least[0])
+        tiles.multiply(self._versions, self._sizes, least, tile, version, pairs, out)
+
+    def _least_of(self, versions: I64) -> float:
+        """Least terms of some versions that count."""
+        assert self._large_terms is not None
+        squares = np.empty(self._n_leaves, np.float32)
+        sum_squares(versions, self._sizes, squares)
+        return self._large_terms.least_of_error(np.sqrt(squares), LEFT_OUT**2 * self._shown, MOVING_BYTES)
 
     def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
         """Products of some tiles of uncompressed rows with values (n, 3) that are 0 but at some cells."""
         assert not self._haar
         leaves = np.zeros((1, self._n_leaves, 4), np.float32)
         leaves[0, cells, :3] = values
-        for lobe in range(len(self._rows)):
-            self._multiply(lobe, leaves, tile, np.zeros_like(tile), out[lobe], False, _NONE, _NONE[0])
+        for lobe, rows in enumerate(self._rows):
+            self._multiply_floats(rows, leaves, tile, np.zeros_like(tile), out[lobe])
 
     def multiply_more(self, b: F32, first: int, out: F32) -> int:
         """Products of some tiles of uncompressed rows, from `first` on, with leaf values (n_leaves, 3).
@@ -219,75 +255,81 @@ class Products:
         """
         assert not self._haar
         begin = np.arange(self.n_tiles + 1) * LANES
-        entries = sum((rows.rows.indptr[np.minimum(begin, rows.rows.n_rows)] for rows in self._rows), 0 * begin)
+        entries = sum((rows.indptr[np.minimum(begin, rows.n_rows)] for rows in self._rows), 0 * begin)
         end = int(np.searchsorted(entries, entries[first] + _ENTRIES_AT_ONCE, side="right")) - 1
         end = min(max(end, first + 1), self.n_tiles)
         values = np.zeros((1, self._n_leaves, 4), np.float32)
         values[0, :, :3] = b
         tile = np.arange(first, end, dtype=np.int32)
-        for lobe in range(len(self._rows)):
-            self._multiply(lobe, values, tile, np.zeros_like(tile), out[lobe, first:end], False, _NONE, _NONE[0])
+        for lobe, rows in enumerate(self._rows):
+            self._multiply_floats(rows, values, tile, np.zeros_like(tile), out[lobe, first:end])
         return end
 
-    def multiply_all(self, b: F32, out: F32, narrow: bool = False) -> None:
+    def multiply_all(self, b: F32, out: F32, narrow: bool = False, known: Callable[[F32], None] | None = None) -> None:
         """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``; `narrow`: as `multiply`.
 
-        Of a large transport, only the terms that are large in this light are read; see `MOVING_BYTES`.
+        Of a large transport, only the terms that are large in this light are read; see `LEFT_OUT`.
+
+        Parameters
+        ----------
+        known
+            Adds to the products what is known of others, so that together they are the unedited light.
         """
-        size, least = _NONE, np.zeros((len(self._rows), 0), np.float32)
-        if self._haar:
-            values = haar_of_versions(self._plan, b[None], self._unedited)
-            if self._large_terms is not None and not narrow:
-                size = np.empty((1, self._n_leaves), np.float32)
-                largest_channels(np.zeros(1, np.int64), values, size)
-                least = np.full((len(self._rows), 1), self._large_terms.least(size[0], MOVING_BYTES), np.float32)
-                size[0, 0] = np.inf  # means stay, however dark it is
-        else:
+        tile = np.arange(self.n_tiles, dtype=np.int32)
+        if not self._haar:
             values = np.zeros((1, self._n_leaves, 4), np.float32)
             values[0, :, :3] = b
-        tile = np.arange(self.n_tiles, dtype=np.int32)
-        for lobe in range(len(self._rows)):
-            self._multiply(
-                lobe, values, tile, np.zeros_like(tile), out[lobe, : self.n_tiles], narrow, size, least[lobe]
-            )
+        else:
+            values = haar_of_versions(self._plan, b[None], self._unedited)
+        tiles = self._narrow if narrow else self._tiles
+        if tiles is None or self._large_terms is None or narrow:
+            if tiles is None:
+                for lobe, rows in enumerate(self._rows):
+                    self._multiply_floats(rows, values, tile, 0 * tile, out[lobe, : self.n_tiles])
+            else:
+                tiles.multiply(values, _NONE, _NONE[0], tile, 0 * tile, tile.astype(np.int64), out)
+            if known is not None:
+                known(out)
+            return
+        size = np.empty((1, self._n_leaves), np.float32)
+        largest_channels(np.zeros(1, np.int64), values, size)
+        size[0, 0] = np.inf  # means stay, however dark it is
+        before = self._shown
+        for _ in range(2):
+            least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
+            leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
+            tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out)
+            if known is not None:
+                known(out)
+            self.see(out)
+            if self._shown >= _DARKER**2 * before:
+                break
 
-    def _multiply(
-        self,
-        lobe: int,
-        versions: F32,
-        tile: I32,
-        version: I32,
-        out: F32,
-        narrow: bool,
-        size: F32,
-        least: F32,
-    ) -> None:
-        """`least` (n_versions,) leaves out terms; empty: none."""
-        chosen = self._narrow if narrow else self._rows
-        assert chosen is not None
-        rows, paired = chosen[lobe].rows, chosen[lobe].paired
-        if not self._haar:
-            kernels.multiply_sparse_pairs(rows.indptr, rows.indices, rows.weights, versions, tile, version, out)
-            return
-        if paired is None:
+    def see(self, products: F32) -> None:
+        """Take products of all tiles for those of the unedited light, beside which others are large or small."""
+        if self._haar and self._large_terms is not None:
+            found = np.empty(self._counts.shape[0] * self._counts.shape[1])
+            squares_of_tiles(products.reshape(*products.shape[:2], 4 * LANES), self._counts, found)
+            self._shown = float(found.sum())
+
+    def _weights_of_rows(self) -> F32:
+        """What the square of each product counts in all pixels, mean of the channels: (n_lobes, n_tiles, 64)."""
+        square = np.mean(self.tints.astype(np.float64) ** 2, axis=2) / 3
+        out = np.zeros((len(square), self.n_tiles * LANES), np.float32)
+        spread = self.interpolation
+        for lobe, of_view in enumerate(square):
+            if self.is_sparse:
+                pixel = np.repeat(np.arange(spread.n_rows), np.diff(spread.indptr))
+                of_view = np.bincount(spread.indices, spread.weights * of_view[pixel], spread.n_columns)
+            out[lobe, : len(of_view)] = of_view
+        return out.reshape(len(square), self.n_tiles, LANES)
+
+    def _multiply_floats(self, rows: Any, versions: F32, tile: I32, version: I32, out: F32) -> None:
+        """Products with rows of one lobe that are not quantised."""
+        if self._haar:
             kernels.multiply_pairs(rows.tile_begin, rows.index, rows.scale, rows.value, versions, tile, version, out)
-            return
-        if len(least):
-            multiply_large_terms(
-                rows.tile_begin,
-                rows.index,
-                rows.scale,
-                rows.worth,
-                rows.value,
-                versions,
-                size,
-                least,
-                tile,
-                version,
-                out,
-            )
-            return
-        multiply_paired_tiles(paired.tile_begin, paired.index, paired.scale, paired.value, versions, tile, version, out)
+        else:
+            kernels.multiply_sparse_pairs(rows.indptr, rows.indices, rows.weights, versions, tile, version, out)
 
 
 def _n_entries(rows: Any) -> int:

@@ -112,10 +112,9 @@ class SharedLight:
         """Multiply some tiles of exact rows with the unedited light, from `first` on; the first tile that is left."""
         return exact.multiply_more(b, first, self._sums)
 
-    def set_unedited_at_rest(self, b: F32, narrow: Narrow, gains: F32) -> None:
-        """The same with the narrowed transport, of lights at rest under gains."""
-        self._products.multiply_all(b, self._sums, narrow=True)
-        narrow.add(gains, self._sums)
+    def set_unedited_near_rest(self, narrow: Narrow, radiance: F32, gains: F32) -> None:
+        """The same of lights (n_lights, n_gather, 3) under gains, of which some may be as they were at rest."""
+        narrow.unedited(radiance, gains, self._sums)
 
     def unedited(self, out: F32) -> None:
         """Unedited indirect light of all view samples into `out`."""

@@ -49,7 +49,7 @@ class Versions:
         self._n_exact = 0  # how many of them there are
         self._known: set[int] = set()  # whose residual is known
         self._reference: F32 = np.zeros((0, 3), np.float32)  # what the differences of these were then
-        self._lost: F32 = products.room(0)  # (n_lobes, n_pairs or more, 64, 4) what narrowed rows lost of that
+        self._known_values: F32 = products.room(0)  # (n_lobes, n_pairs or more, 64, 4) exact products of that
         self._pairs = PairLists(products)
         self._light: F32 | None = None
         self._changed_rows: U8 = np.zeros(1 + compiled.n_rows, np.uint8)
@@ -145,7 +145,8 @@ class Versions:
         self._number = {version.key: v for v, version in enumerate(versions)}
         self._delta, self._offset, self._reference = Growing(deltas), Growing(self.offsets[kept]), references
         pairs = self._pairs.keep(kept)
-        self._lost = np.ascontiguousarray(self._lost[:, pairs]) if self._lost.shape[1] else self._lost
+        if self._known_values.shape[1]:
+            self._known_values = np.ascontiguousarray(self._known_values[:, pairs])
         self._stale, self._refined, self._known = (
             {number[v] for v in some & needed} for some in (self._stale, self._refined, self._known)
         )
@@ -157,7 +158,7 @@ class Versions:
     def stack_changed(self, compiled: CompiledStack, rows: Iterable[int], painted: Iterable[int]) -> None:
         """Go on with another stack of the same structure, of which some rows act differently, some on other casters."""
         self._compiled = compiled
-        # What is lost of a difference follows from what was lost before only while it stays similar.
+        # A difference on other casters has little in common with what it was.
         self._known -= {v for v in self._known if not self._rows_of(v).isdisjoint(painted)}
         changed = set(rows)
         if changed:
@@ -167,8 +168,9 @@ class Versions:
             if self._pair_products is not None:
                 self._pair_products.stack_changed(stale)
 
-    def forget_residuals(self) -> None:
-        """Multiply with all of the rows until the next refinement."""
+    def forget_products(self) -> None:
+        """Multiply all of the differences anew."""
+        self._stale |= self._known
         self._known = set()
 
     def light_changed(self, b: F32) -> None:
@@ -184,11 +186,12 @@ class Versions:
             return
         fresh = self._pairs.add(version, tile)
         if self._known:
-            self._lost = self._pairs.grown(self._lost)
+            self._known_values = self._pairs.grown(self._known_values)
         else:
-            self._lost = self._products.room(0)
+            self._known_values = self._products.room(0)
         some = set(version.tolist())
-        self._stale |= {v for v in some if self._is_by_pairs(v)}
+        # What was prepared of known ones is their rest alone.
+        self._stale |= {v for v in some if self._is_by_pairs(v)} | (some & self._known)
         self._refined -= some
         self._exact_of = -1
         self._known -= some
@@ -233,11 +236,15 @@ class Versions:
             self.offsets[stale] = 0
             np.add.at(self.offsets, pieces[:, 0], sums)
         plain = np.array([v for v in stale if not self._is_by_pairs(v)], np.int64)
-        self._products.prepare(plain, tables, self._deltas)
         known = np.array([v in self._known for v in plain], np.bool_)
-        pairs = self._pairs_of_some(plain[~known])
-        self._multiply(pairs)
-        self._multiply_narrow(plain[known])
+        factors = np.zeros((self.n if known.any() else 0, LANES), np.float32)
+        rest = self._deltas
+        if known.any():
+            rest = rest.copy()
+            proportions(pieces[np.isin(pieces[:, 0], plain[known])], self._deltas, self._reference, factors, rest)
+        self._products.prepare(plain, tables, rest)
+        self._multiply(self._pairs_of_some(plain[~known]))
+        self._multiply_rest(plain[known], factors)
         for v in stale:
             if self._is_by_pairs(v):
                 self._multiply_by_pairs(int(v))
@@ -260,16 +267,14 @@ class Versions:
         version = self._versions[v]
         return frozenset() if version is None else version.rows
 
-    def _multiply_narrow(self, versions: I64) -> None:
-        """With narrowed rows, and with what these lost the last time of a difference of about the same shape."""
+    def _multiply_rest(self, versions: I64, factors: F32) -> None:
+        """What is not like an earlier difference, and to that the exact products of the earlier one times factors."""
         if not len(versions):
             return
         pairs = self._pairs_of_some(versions)
-        self._multiply(pairs, narrow=True)
-        factors = np.zeros((self.n, LANES), np.float32)
-        proportions(versions, self._lists.tables.cell_begin, self._deltas, self._reference, factors)
-        lost, values = (array.reshape(*array.shape[:2], 4 * LANES) for array in (self._lost, self.values))
-        add_version_residuals(pairs, self._pairs.version, lost, factors, values)
+        self._multiply(pairs, narrow=self._products.is_narrow)
+        known, values = (array.reshape(*array.shape[:2], 4 * LANES) for array in (self._known_values, self.values))
+        add_version_residuals(pairs, self._pairs.version, known, factors, values)
 
     def refine(self, exact: Products) -> bool:
         """Multiply some pairs with exact rows that were multiplied with packed ones; False when none is left."""
@@ -295,21 +300,20 @@ class Versions:
             if part.stop < len(pairs):
                 return True
             if narrow:
-                self._learn_residual(v, self._exact)
+                self._learn(v, self._exact)
             self.values[:, pairs] = self._exact
             self._refined.add(v)
         return False
 
-    def _learn_residual(self, v: int, exact: F32) -> None:
-        """Keep what narrowed rows lose of a version of which the exact products are known."""
-        self._lost = self._pairs.grown(self._lost)
+    def _learn(self, v: int, exact: F32) -> None:
+        """Keep a version's exact products, and what they are the products of."""
+        self._known_values = self._pairs.grown(self._known_values)
         if len(self._reference) != len(self._deltas):
             reference = np.zeros_like(self._deltas)
             reference[: len(self._reference)] = self._reference
             self._reference = reference
         pairs, some = self._pairs.of_version[v], self._lists.part(v)
-        self._multiply(pairs, narrow=True)
-        self._lost[:, pairs] = exact - self.values[:, pairs]
+        self._known_values[:, pairs] = exact
         self._reference[some] = self._deltas[some]
         self._known.add(v)
 

@@ -199,15 +199,30 @@ class LargeTerms:
         self._worth = np.concatenate([of_lobe.worth[some] for of_lobe, some in parts])
 
     def least(self, size: F32, max_bytes: int) -> float:
-        """Least ``worth * size`` of terms, so that larger ones take about `max_bytes`.
+        """Least ``worth * size`` of terms, so that larger ones take about `max_bytes`; roots always stay.
 
         Parameters
         ----------
         size : (n_leaves,) float32
             Largest size of each Haar coefficient of the light.
         """
-        n_kept = round(len(self._index) * max_bytes / (max(self.n_terms, 1) * _BYTES_OF_TERM))
-        if n_kept >= len(self._index):
+        return float(self._least(np.sort(self._terms(size)), max_bytes))
+
+    def least_of_error(self, size: F32, squared_error: float, max_bytes: int) -> float:
+        """The same, so that squares of smaller ones sum up to `squared_error` over all pixels, or as `least` has it."""
+        terms = np.sort(self._terms(size))
+        left_out = np.cumsum(np.square(terms, dtype=np.float64)) * (self.n_terms / max(len(terms), 1))
+        n_left_out = int(np.searchsorted(left_out, squared_error))
+        by_error = terms[n_left_out] if n_left_out < len(terms) else np.inf
+        return float(max(by_error, self._least(terms, max_bytes)))
+
+    def _terms(self, size: F32) -> F32:
+        terms: F32 = np.where(self._index == 0, np.float32(np.inf), np.take(size, self._index) * self._worth)
+        return terms  # roots stay
+
+    def _least(self, terms: F32, max_bytes: int) -> float:
+        """Of terms in ascending order."""
+        n_kept = round(len(terms) * max_bytes / (max(self.n_terms, 1) * _BYTES_OF_TERM))
+        if n_kept >= len(terms):
             return 0.0
-        term = np.where(self._index == 0, np.float32(np.inf), np.take(size, self._index) * self._worth)  # roots stay
-        return float(np.partition(term, -n_kept)[-n_kept]) if n_kept > 0 else np.inf
+        return float(terms[-n_kept]) if n_kept > 0 else np.inf

@@ -6,8 +6,8 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.large_terms import multiply_large_terms
-from icheat_usd.kernels.packed import multiply_tiles
+from icheat_usd.kernels.large_terms import multiply_terms
+from icheat_usd.kernels.packed import join_tiles, multiply_tiles, pair_coefficients
 
 N_COEFFICIENTS = 300
 
@@ -32,18 +32,36 @@ def some_light() -> np.ndarray:
 PAIR_TILE, PAIR_VERSION = np.array([0, 0, 1, 2, 3, 1], np.int32), np.array([0, 1, 1, 0, 0, 0], np.int32)
 
 
+PLACE = np.arange(len(PAIR_TILE), dtype=np.int32)
+
+
+def beside(large: np.ndarray) -> np.ndarray:
+    """With the other one of each two coefficients that are multiplied together."""
+    padded = np.append(large, np.zeros(len(large) % 2, np.bool_)).reshape(-1, 2)
+    return np.repeat(padded.any(axis=1), 2)[: len(large)]
+
+
 @pytest.mark.parametrize("least", [0.0, 0.01, 0.3, 1e6])
 def test_the_product_is_that_of_the_large_terms(least: float) -> None:
     begin, index, scale, worth, value = some_tiles()
     light = some_light()
     size = np.abs(light).max(axis=2)
     expected, found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
-    multiply_large_terms(
-        begin, index, scale, worth, value, light, size, np.full(2, least, np.float32), PAIR_TILE, PAIR_VERSION, found
+    leasts = np.full(2, least, np.float32)
+    multiply_terms(
+        *pair_coefficients(begin, index, scale, worth, value),
+        light,
+        size,
+        leasts,
+        PAIR_TILE,
+        PAIR_VERSION,
+        PLACE[::-1].copy(),
+        found,
     )
+    found = found[::-1]
     for p, (tile, version) in enumerate(zip(PAIR_TILE, PAIR_VERSION, strict=True)):
         entries = slice(begin[tile], begin[tile + 1])
-        large = size[version, index[entries]] * worth[entries] >= np.float32(least)
+        large = beside(size[version, index[entries]] * worth[entries] >= np.float32(least))
         some = np.array([0, large.sum()], np.int64)
         one = np.zeros(1, np.int32)
         multiply_tiles(
@@ -68,9 +86,26 @@ def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
     begin, index, scale, worth, value = some_tiles()
     light = some_light()
     size, least = np.abs(light).max(axis=2), np.full(2, 0.01, np.float32)
+    paired = pair_coefficients(begin, index, scale, worth, value)
     found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
     for threads, out in zip((1, 2), found, strict=True):
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-        multiply_large_terms(begin, index, scale, worth, value, light, size, least, PAIR_TILE, PAIR_VERSION, out)
+        multiply_terms(*paired, light, size, least, PAIR_TILE, PAIR_VERSION, PLACE, out)
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert np.array_equal(found[0], found[1])
+
+
+def test_tiles_of_two_lobes_are_those_of_each() -> None:
+    begin, index, scale, worth, value = some_tiles()
+    light = some_light()
+    one = pair_coefficients(begin, index, scale, worth, value)
+    other = pair_coefficients(begin, index[::-1].copy(), 2 * scale, worth, value)
+    none, n = np.zeros((1, 0), np.float32), len(PAIR_TILE)
+    joined, apart = np.zeros((2, 2 * n, 64, 4), np.float32)
+    tile, version = np.concatenate([PAIR_TILE, PAIR_TILE + 4]), np.tile(PAIR_VERSION, 2)
+    place = np.arange(2 * n, dtype=np.int32)
+    multiply_terms(*join_tiles([one, other]), light, none, none[0], tile, version, place, joined)
+    for part, tiles in ((apart[:n], one), (apart[n:], other)):
+        multiply_terms(*tiles, light, none, none[0], PAIR_TILE, PAIR_VERSION, PLACE, part)
+    assert apart[n:].any()
+    assert np.array_equal(joined, apart)

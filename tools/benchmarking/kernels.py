@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels.assemble import assemble_film, chunks_in_order, sum_scaled
 from icheat_usd.kernels.film_table import film_table
-from icheat_usd.kernels.packed import LANES, PairedTiles, multiply_paired_tiles, multiply_tiles, pair_coefficients
+from icheat_usd.kernels.large_terms import multiply_terms
+from icheat_usd.kernels.packed import LANES, PairedTiles, multiply_tiles, pair_coefficients
 from icheat_usd.kernels.simd import address_of, load, multiply_add, spread, store, zeros
 from icheat_usd.samples import ViewSamples
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
@@ -32,6 +33,7 @@ from icheat_usd.transport.sparse import SparseRows
 
 Work = Callable[[], Any]
 
+_NONE: F32 = np.zeros((1, 0), np.float32)  # no term is left out
 _READ_PARTS = 32
 _MOST_ENTRIES = 150_000_000  # of a peer's matrix, 8 bytes each
 
@@ -133,7 +135,7 @@ class _Product:
         )
 
     def in_integers(self) -> None:
-        multiply_paired_tiles(*self.paired, self.coefficients, self.tile, self.version, self.out)
+        multiply_terms(*self.paired, self.coefficients, _NONE, _NONE[0], self.tile, self.version, self.tile, self.out)
 
 
 def _products(packed: PackedTransport, b: F32) -> list[_Product]:
@@ -142,7 +144,8 @@ def _products(packed: PackedTransport, b: F32) -> list[_Product]:
         rows = lobe.rows
         if len(rows.index) and rows.value.dtype == np.int8:
             n = len(rows.tile_begin) - 1
-            paired = pair_coefficients(rows.tile_begin, rows.index, rows.scale, np.asarray(rows.value, np.int8))
+            quanta = np.asarray(rows.value, np.int8)
+            paired = pair_coefficients(rows.tile_begin, rows.index, rows.scale, rows.worth, quanta)
             coefficients = haar_of_versions(plan_haar(rows.tree), b[None])
             tile = np.arange(n, dtype=np.int32)
             products.append(
