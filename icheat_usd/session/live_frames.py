@@ -284,7 +284,8 @@ class LiveFrames:
                 self._tell(LiveEvent("better", number, frame.level))
             assert evaluator is not None
             self._shared.keep("evaluator", key, evaluator)
-        self._show(number, frame, evaluator, level, began)
+        if frame.evaluator is not evaluator or frame.level is not level:
+            self._show(number, frame, evaluator, level, began)
         self._forget_parts(number, *((level,) if level is Level.PREVIEW else Level))
 
     def _evaluator(self, parts: ShotParts, transport: Transport | PackedTransport, level: Level) -> Evaluator:
@@ -293,6 +294,8 @@ class LiveFrames:
             state = self.state
         evaluator = Evaluator(parts, transport, is_coarse=level is Level.PREVIEW)
         evaluator.show(self._read_stack(parts.snapshot), state)
+        # Its kernels are compiled here if need be: who asks for the image would wait for whatever is compiled next.
+        evaluator.frame()
         return evaluator
 
     def _show(self, number: float | None, frame: LiveFrame, evaluator: Evaluator, level: Level, began: float) -> None:

@@ -166,6 +166,7 @@ def test_surfaces_are_shown_before_there_is_light(stage: Path) -> None:
         live.frame()
     kinds = [event.kind for event in heard if event.kind != "progress"]
     assert kinds[0] == "surfaces" and kinds.count("surfaces") == 1
+    assert sum(event.kind == "better" and event.level == "preview" for event in heard) == 1
     image = next(event.image for event in heard if event.kind == "surfaces")
     assert image is not None and image.shape == (15, 20, 3) and image.dtype == np.float32
     assert 0 < image.min() and image.max() < 1
