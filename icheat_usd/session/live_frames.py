@@ -11,6 +11,7 @@ from icheat_usd.edits.model import EMPTY_STACK, EditStack
 from icheat_usd.errors import IcheatError
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
+from icheat_usd.kernels.workers import start_workers
 from icheat_usd.progress import silent
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.session import authoring
@@ -72,6 +73,7 @@ class LiveFrames:
         self._building: dict[tuple[float | None, Level], ShotParts] = {}
         self._building_version = 0  #: of the lights in `_building`
         self._job: tuple[float | None, Level] = (None, Level.NONE)
+        start_workers()
         self._background = Background(self._next_job, self._on_error, kernels_may_overlap)
         self._background.start()
 
