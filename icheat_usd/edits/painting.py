@@ -9,7 +9,7 @@ import numpy as np
 from icheat_usd.edits.model import MaskedSurface, SurfaceMask
 from icheat_usd.errors import EditError
 from icheat_usd.kernels.texels import texel_positions
-from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.scene import F32, I64, SceneSnapshot
 
 #: (n, 3) world positions in metres about the scene's centre -> (n,) weights.
 Brush = Callable[[F32], F32]
@@ -71,19 +71,27 @@ def _painted(snapshot: SceneSnapshot, row: int, brush: Brush, resolution: int) -
     return (np.round(weights * 255) / np.float32(255)).astype(np.float32).reshape(positions.shape[:3])
 
 
-def surface_texel_positions(snapshot: SceneSnapshot, row: int, resolution: int) -> F32:
-    """Texel centres on the control faces of one surface, (n_faces, resolution, resolution, 3) in object space.
+def surface_texel_positions(snapshot: SceneSnapshot, row: int, resolution: int, faces: I64 | None = None) -> F32:
+    """Texel centres on control faces of one surface, (n_faces, resolution, resolution, 3) in object space.
 
     0 for a surface that nothing shows.
+
+    Parameters
+    ----------
+    faces : (n,), optional
+        Which of them, ascending; all if not given.
     """
-    geometry, n_faces = snapshot.geometry, snapshot.surfaces[row].n_faces
-    positions = np.zeros((n_faces, resolution, resolution, 3), np.float32)
+    geometry = snapshot.geometry
+    wanted = np.arange(snapshot.surfaces[row].n_faces) if faces is None else faces
+    positions = np.zeros((len(wanted), resolution, resolution, 3), np.float32)
     for instance in np.flatnonzero(geometry.instance_surface == row)[:1]:
         mesh = geometry.instance_mesh[instance]
-        some = slice(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
-        face = geometry.face[some]
+        triangles = np.arange(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
+        if faces is not None:
+            triangles = triangles[np.isin(geometry.face[triangles], faces)]
+        face = geometry.face[triangles]
         order = np.argsort(face, kind="stable")
-        begins = np.searchsorted(face[order], np.arange(n_faces + 1)).astype(np.int64)
-        points, uv = (np.ascontiguousarray(values[some][order]) for values in (geometry.points, geometry.face_uv))
+        begins = np.searchsorted(face[order], np.append(wanted, wanted[-1:] + 1)).astype(np.int64)
+        points, uv = (np.ascontiguousarray(values[triangles[order]]) for values in (geometry.points, geometry.face_uv))
         texel_positions(begins, points, uv, resolution, positions)
     return positions

@@ -9,34 +9,52 @@ import numpy as np
 from icheat_usd.edits.model import MaskedSurface, SurfaceMask
 from icheat_usd.edits.painting import soft_sphere, surface_texel_positions
 from icheat_usd.errors import EditError
-from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.scene import F32, I64, SceneSnapshot
 
 RESOLUTION = 16  #: texels along each side of a control face
+_FACES_AT_ONCE = 1024  # whose texels are looked at together
 
 
 class TexelPlaces:
-    """Where texels of a scene's surfaces lie, worked out once for each surface that is painted on."""
+    """Where texels of a scene's surfaces lie; of each surface that is painted on, the boxes of its faces are kept."""
 
     def __init__(self, snapshot: SceneSnapshot) -> None:
         self.snapshot = snapshot
-        self._known: dict[tuple[int, int], tuple[F32, F32]] = {}
+        #: row of each surface by path, instance and part
+        self.rows = {(s.path, s.instance_id, s.part): row for row, s in enumerate(snapshot.surfaces)}
+        self._boxes: dict[tuple[int, int], F32] = {}
 
-    def near(self, row: int, resolution: int, centre: F32, radius: float) -> F32 | None:
-        """(n_faces, resolution, resolution, 3) world metres about the scene's centre; None if none lies so near."""
-        if (row, resolution) not in self._known:
-            self._known[row, resolution] = self._places(row, resolution)
-        places, box = self._known[row, resolution]
-        outside = np.maximum(np.maximum(box[0] - centre, centre - box[1]), 0)
-        return None if float(np.linalg.norm(outside)) > radius or not places.size else places
+    def near(self, row: int, resolution: int, centre: F32, radius: float) -> tuple[I64, F32]:
+        """Faces of a surface that may have a texel so near, and the places of theirs.
 
-    def _places(self, row: int, resolution: int) -> tuple[F32, F32]:
-        places = surface_texel_positions(self.snapshot, row, resolution)
+        Returns
+        -------
+        faces : (n,) ascending
+        places : (n, resolution, resolution, 3) world metres about the scene's centre
+        """
+        if (row, resolution) not in self._boxes:
+            self._boxes[row, resolution] = self._box_of_faces(row, resolution)
+        boxes = self._boxes[row, resolution]
+        outside = np.maximum(np.maximum(boxes[:, 0] - centre, centre - boxes[:, 1]), 0)
+        faces = np.flatnonzero(np.einsum("fi,fi->f", outside, outside) <= np.float32(radius * 1.0001) ** 2)
+        return faces, self._places(row, resolution, faces)
+
+    def _places(self, row: int, resolution: int, faces: I64) -> F32:
+        places = surface_texel_positions(self.snapshot, row, resolution, faces)
         for instance in np.flatnonzero(self.snapshot.geometry.instance_surface == row)[:1]:
             matrix = self.snapshot.geometry.instance_to_world[instance]
             places = (places @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
-        flat = places.reshape(-1, 3)
-        box = np.stack([flat.min(axis=0), flat.max(axis=0)]) if len(flat) else np.zeros((2, 3), np.float32)
-        return places, box
+        return places
+
+    def _box_of_faces(self, row: int, resolution: int) -> F32:
+        """Least and greatest coordinates of the texels of each face, (n_faces, 2, 3)."""
+        n_faces = self.snapshot.surfaces[row].n_faces
+        boxes = np.empty((n_faces, 2, 3), np.float32)
+        for first in range(0, n_faces, _FACES_AT_ONCE):
+            faces = np.arange(first, min(first + _FACES_AT_ONCE, n_faces))
+            places = self._places(row, resolution, faces)
+            boxes[faces, 0], boxes[faces, 1] = places.min(axis=(1, 2)), places.max(axis=(1, 2))
+        return boxes
 
 
 def filled_mask(places: TexelPlaces, paths: Iterable[str], weight: float) -> SurfaceMask:
@@ -87,24 +105,26 @@ def dabbed(
     if mask is None:
         mask = filled_mask(places, paths, 1.0)
     brush = soft_sphere((float(centre[0]), float(centre[1]), float(centre[2])), 0.0, radius)
-    row_of = {(s.path, s.instance_id, s.part): row for row, s in enumerate(snapshot.surfaces)}
     texels = mask.texels.copy()
     begin = 0
     for surface in mask.surfaces:
         some = slice(begin, begin + surface.n_faces)
         begin += surface.n_faces
-        row = row_of.pop((surface.path, surface.instance_id, surface.part), None)
-        at = None if row is None else places.near(row, mask.resolution, centre, radius)
-        if at is not None and len(at) == surface.n_faces:
-            texels[some] = _moved(texels[some], brush(at.reshape(-1, 3)).reshape(at.shape[:3]), strength)
+        row = places.rows.get((surface.path, surface.instance_id, surface.part))
+        if row is None or snapshot.surfaces[row].n_faces != surface.n_faces:
+            continue
+        faces, at = places.near(row, mask.resolution, centre, radius)
+        faces = some.start + faces
+        texels[faces] = _moved(texels[faces], brush(at.reshape(-1, 3)).reshape(at.shape[:3]), strength)
     wanted = frozenset(paths)
+    named = {(surface.path, surface.instance_id, surface.part) for surface in mask.surfaces}
     new: list[tuple[int, F32]] = []
-    for row in [row for name, row in row_of.items() if name[0] in wanted and strength > 0]:
-        at = places.near(row, mask.resolution, centre, radius)
-        if at is not None:
-            weights = brush(at.reshape(-1, 3)).reshape(at.shape[:3])
-            if weights.any():
-                new.append((row, _moved(np.zeros_like(weights), weights, strength)))
+    for row in [row for name, row in places.rows.items() if strength > 0 and name[0] in wanted and name not in named]:
+        faces, at = places.near(row, mask.resolution, centre, radius)
+        weights = np.zeros((snapshot.surfaces[row].n_faces, mask.resolution, mask.resolution), np.float32)
+        weights[faces] = brush(at.reshape(-1, 3)).reshape(at.shape[:3])
+        if weights.any():
+            new.append((row, _moved(np.zeros_like(weights), weights, strength)))
     if not new:
         return SurfaceMask(mask.surfaces, texels, mask.rest)
     rest = None if mask.rest is None else np.concatenate([mask.rest, _rest(snapshot, [row for row, _ in new])])

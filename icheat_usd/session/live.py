@@ -348,14 +348,26 @@ class LiveSession(LiveAuthoring):
     def _go(
         self, state: LiveState, written: Sequence[tuple[LayerVersion, LayerVersion]], is_about_lights: bool
     ) -> None:
+        """All of it or, after an error, nothing."""
+        before, done = self._frames.state, list[tuple[LayerVersion, LayerVersion]]()
         with self._frames.stage_lock:
-            for now, then in written:
-                go_to_version(now, then)
-        if written:
-            self._frames.stacks_changed()
-        self._frames.set_state(state)
+            try:
+                for now, then in written:
+                    go_to_version(now, then)
+                    done.append((then, now))
+                self._show_again(state, bool(written))
+            except Exception:
+                for now, then in reversed(done):
+                    go_to_version(now, then)
+                self._show_again(before, bool(done))
+                raise
         if is_about_lights:
             self._frames.lights_changed()
+
+    def _show_again(self, state: LiveState, with_layers: bool) -> None:
+        if with_layers:
+            self._frames.stacks_changed()
+        self._frames.set_state(state)
 
     # Time -------------------------------------------------------------------------------------------------------------
 

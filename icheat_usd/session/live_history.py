@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+from icheat_usd.session.kept_states import KeptState, StateShelf
 from icheat_usd.session.live_state import LiveState
 from icheat_usd.stage.layer_versions import LayerVersion
 
 #: Pairs (what a layer says now, what it is to say).
 Written = Sequence[tuple[LayerVersion, LayerVersion]]
 
-#: Steps that undo goes back at most.
-_LONGEST = 500
+#: Steps that undo goes back at most, and bytes of arrays that these keep; the last step stays, however large.
+_LONGEST, _MOST_BYTES = 500, 128 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,19 +29,32 @@ class Step:
 
 
 class LiveHistory:
-    """Done and undone steps. A step that cannot be taken back stays where it is."""
+    """Done and undone steps. A step that cannot be taken back stays where it is.
 
-    def __init__(self) -> None:
-        self._done: list[Step] = []
-        self._undone: list[Step] = []
+    Steps share what their masks have in common. The oldest are forgotten when
+    there are too many of them, or when they take too much memory.
+    """
+
+    def __init__(self, most_bytes: int = _MOST_BYTES) -> None:
+        self._most_bytes = most_bytes
+        self._shelf = StateShelf()
+        self._done: list[_KeptStep] = []
+        self._undone: list[_KeptStep] = []
         self._n_forgotten = 0
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the arrays of all steps, each counted once."""
+        return self._shelf.bytes
 
     def add(self, step: Step) -> None:
         """Something was done; what was undone before cannot be done again."""
-        self._undone.clear()
-        self._done.append(step)
-        self._n_forgotten += max(0, len(self._done) - _LONGEST)
-        del self._done[:-_LONGEST]
+        self._forget(self._undone)
+        self._undone = []
+        self._done.append(self._kept(step))
+        while len(self._done) > 1 and (len(self._done) > _LONGEST or self.bytes > self._most_bytes):
+            self._forget([self._done.pop(0)])
+            self._n_forgotten += 1
 
     def mark(self) -> int:
         """A place in the history, for `join`."""
@@ -52,14 +67,16 @@ class LiveHistory:
         if steps:
             written = tuple(pair for step in steps for pair in step.written)
             is_about_lights = any(step.is_about_lights for step in steps)
-            self._done[first:] = [Step(label, steps[0].before, steps[-1].after, written, is_about_lights)]
+            before, after = steps[0].before.whole(), steps[-1].after.whole()
+            self._done[first:] = [self._kept(Step(label, before, after, written, is_about_lights))]
+            self._forget(steps)
 
     def undo(self, go: Callable[[LiveState, Written, bool], None]) -> str | None:
         """Have `go` bring back what was before the last step; its label, or None."""
         if not self._done:
             return None
         step = self._done[-1]
-        go(step.before, [(after, before) for before, after in reversed(step.written)], step.is_about_lights)
+        go(step.before.whole(), [(after, before) for before, after in reversed(step.written)], step.is_about_lights)
         self._undone.append(self._done.pop())
         return step.label
 
@@ -68,6 +85,25 @@ class LiveHistory:
         if not self._undone:
             return None
         step = self._undone[-1]
-        go(step.after, step.written, step.is_about_lights)
+        go(step.after.whole(), step.written, step.is_about_lights)
         self._done.append(self._undone.pop())
         return step.label
+
+    def _kept(self, step: Step) -> _KeptStep:
+        before, after = self._shelf.keep(step.before), self._shelf.keep(step.after)
+        return _KeptStep(step.label, before, after, step.written, step.is_about_lights)
+
+    def _forget(self, steps: Sequence[_KeptStep]) -> None:
+        for step in steps:
+            self._shelf.forget(step.before)
+            self._shelf.forget(step.after)
+
+
+class _KeptStep(NamedTuple):
+    """A `Step`."""
+
+    label: str
+    before: KeptState
+    after: KeptState
+    written: tuple[tuple[LayerVersion, LayerVersion], ...]
+    is_about_lights: bool
