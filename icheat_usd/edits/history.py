@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from icheat_usd.edits.model import EMPTY_STACK, EditStack
+from icheat_usd.edits.model import EMPTY_STACK, Edit, EditStack
 from icheat_usd.errors import EditError
 
-#: Steps that can be undone; the oldest are forgotten first, as stacks keep their painted masks.
-MOST_STEPS = 256
+#: Steps that can be undone, and bytes of painted masks that they keep; the oldest are forgotten first.
+MOST_STEPS, MOST_BYTES = 256, 256 << 20
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class History:
         """One step further; what was undone before is forgotten, and a stack that is shown already is no step."""
         if stack is self.stack:
             return self
-        stacks = (*self.stacks[: self.cursor + 1], stack)[-MOST_STEPS - 1 :]
+        stacks = _newest((*self.stacks[: self.cursor + 1], stack))
         return History(stacks, len(stacks) - 1)
 
     def undone(self) -> History:
@@ -60,3 +60,29 @@ class History:
         if not self.can_redo:
             raise EditError("there is nothing to redo: nothing was undone since the last change")
         return History(self.stacks, self.cursor + 1)
+
+
+def _newest(stacks: tuple[EditStack, ...]) -> tuple[EditStack, ...]:
+    """As many of the last stacks as there is room for; at least the last one and that before it."""
+    seen: set[int] = set()
+    n, size = 0, 0
+    for stack in stacks[: -MOST_STEPS - 2 : -1]:
+        for edit in stack.edits:
+            if id(edit) not in seen:
+                seen.add(id(edit))
+                size += _unseen_bytes(edit, seen)
+        if n >= 2 and size > MOST_BYTES:
+            break
+        n += 1
+    return stacks[-n:]
+
+
+def _unseen_bytes(edit: Edit, seen: set[int]) -> int:
+    """Memory of the masks of an edit that are not among those seen, which they join."""
+    payloads = [key.payload for key in edit.keys if key.payload is not None]
+    masks = [mask for payload in payloads for mask in (payload.receiver_mask, payload.caster_mask) if mask is not None]
+    size = 0
+    for array in (array for mask in masks for array in (mask.texels, mask.rest) if array is not None):
+        size += 0 if id(array) in seen else array.nbytes
+        seen.add(id(array))
+    return size
