@@ -259,13 +259,18 @@ def _light_run(
         function, arguments, opaque, passing, distant, place, run, scratch, chosen, share_rays, phase,
         known[run * RUN : run * RUN + size], rows, state,
     )  # fmt: skip
+    lit = False
     for j in range(RUN):
         if state[j] == _BLOCKED:
             scratch[_LEVEL, j] = _ZERO
-    if lobe >= 0:
+        else:
+            lit = True
+    if not lit:
+        scratch[_TO_X : _TO_Z + 1] = _ZERO
+    elif lobe >= 0:
         for lane in range(0, RUN, 16):
             _shine(address_of(gloss) + lobe * (GLOSS * RUN * 4), here, lane, start)
-    for lane in range(0, RUN, 16):
+    for lane in range(0, RUN if lit else 0, 16):
         at = start + lane * 4
         level = load(at + _LEVEL * RUN * 4)
         for c in range(3):
