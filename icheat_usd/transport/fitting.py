@@ -13,9 +13,9 @@ from icheat_usd.transport.outliers import Judge, Survey
 from icheat_usd.transport.records import BUCKET, Records
 from icheat_usd.transport.sparse import SparseRows, select_rows
 
-_WORTH_IT = 3e-4  # squared relative error from which a sample's weights are fitted
+_WORTH_IT = 1e-3  # squared relative error from which a sample's weights are fitted
 _PRIOR = 0.1  # how strongly they stay near the given ones
-_MOST, _LEAST = 6, 0.02  # entries of a sample, and the smallest weight among them
+_MOST, _LEAST = 4, 0.05  # entries of a sample, and the smallest weight among them
 
 
 def fit_weights(records: Records, survey: Survey, tint: F32) -> Records:

@@ -26,7 +26,7 @@ from icheat_usd.transport.sparse import SparseRows, concatenate_rows, take_rows
 _PLACING_RAYS = 128
 #: The same for every view sample, when outliers are looked for.
 _SURVEY_RAYS = 64
-_STRONG = 0.2  # reflectance: what reflects less follows from its neighbours, or is not missed
+_STRONG = 0.2  # reflectance: what reflects less gets no records of its own for that
 _SURVEYED_AT_ONCE = 1 << 15  # samples, whose rows are held in memory
 _FIRST_RAYS = 256  # of each record by itself, by which the others are allotted
 _GROWTH = 4  # of the rays from one transport to the next
@@ -126,8 +126,7 @@ def build_transports(
     def survey() -> Survey:
         """The light at every view sample."""
         order = _in_image_tiles(view, np.arange(view.n))
-        strong = is_glossy(view.points) & (view.points.specular.max(axis=1) >= _STRONG)
-        glossy = order[strong[order]]
+        glossy = order[is_glossy(view.points)[order]]
         diffuse = np.concatenate([pieces.get(partial(look, samples)) for samples in _chunks(order)])
         reflected = np.concatenate([pieces.get(partial(look_specular, samples)) for samples in _chunks(glossy)])
         by_sample = np.empty_like(diffuse)
@@ -161,8 +160,10 @@ def build_transports(
     assert records is not None
     placed.clear()
     seen = survey()
-    records = fit_weights(add_outliers(records, seen, tint, settings), seen, tint)
-    del seen
+    strong = np.flatnonzero(view.points.specular[seen.glossy].max(axis=1) >= _STRONG)
+    sure = Survey(seen.diffuse, seen.glossy[strong], seen.specular[strong])
+    records = fit_weights(add_outliers(records, sure, tint, settings), seen, tint)
+    del seen, sure
 
     order, spread = _in_tiles(view, records)
     samples = records.view[order].astype(np.int64)

@@ -240,7 +240,7 @@ class RowBuilder:
             Of each of these, (n_glossy,); one number is for strong reflections, see `specular_counts`.
         """
         seed = self._seed_for(2)
-        counts = specular_counts(points, glossy, n_rays) if isinstance(n_rays, int) else n_rays
+        counts = n_rays if isinstance(n_rays, np.ndarray) else specular_counts(points, glossy, n_rays)
         second: list[F32] = []
         parts: list[tuple[I64, SparseRows, F32]] = []
         for rays in np.unique(counts).tolist():
