@@ -26,7 +26,7 @@ from icheat_usd.tracing import Tracer, spawn_points, transmittance
 _CELLS = BANDS * COLUMNS
 
 _POINTS = 1 << 15  # that vote for the leaves: more only make the tree slower to build
-_GROUPS_AT_ONCE = 128  # densities learnt together: a quarter of a million rays
+_GROUPS_AT_ONCE = 64  # densities learnt together: an eighth of a million rays
 
 
 Result = TypeVar("Result")

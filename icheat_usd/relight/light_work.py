@@ -226,16 +226,16 @@ class MovingLight:
         self._step = self._n_found = 0
         self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
-        self.following = Following(around)  #: may be set from before to spare work
-        self._cells = np.zeros((around.gather.n, 3), np.float32)
-        self._view = np.zeros((around.view.n, 3), np.float32)
+        self.following: Following | None = None  #: set from before to spare work
+        self._cells = self._view = np.empty((0, 3), np.float32)  # from the first step on
 
     def show(self, radiance: F32, view_direct: F32) -> None:
         """First look: a shadow ray per cell, and where neighbours disagree one per view sample.
 
         Near the look before, a part of these rays is enough.
         """
-        around, last = self._around, self.following
+        around = self._around
+        self.following = last = self.following or Following(around)
         assert around.shadows is not None and around.cells is not None and around.tiles is not None
         direct = np.empty((around.gather.n, 3), np.float32)
         direct_at(self._alone, around.shadows, around.cells, self._seed, False, direct, last=last.cells)
@@ -247,6 +247,8 @@ class MovingLight:
         """Another round at the cells or at the view; False after the last."""
         around = self._around
         assert around.shadows is not None and around.patches is not None and around.tiles is not None
+        if self._step == 0:
+            self._cells, self._view = (np.zeros((n, 3), np.float32) for n in (around.gather.n, around.view.n))
         turn, at_view = divmod(self._step, 2)
         self._step += 1
         if turn >= self._rounds:
@@ -299,9 +301,8 @@ class AnyLight:
         self._exact: ExactBounces | None = None
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
-        self._cells = np.zeros((around.gather.n, 3), np.float32)
-        self._view = np.zeros((around.view.n, 3), np.float32)
-        self.following = Following(around)  #: may be set from before to spare work
+        self._cells = self._view = np.empty((0, 3), np.float32)  # from the first step on
+        self.following: Following | None = None  #: set from before to spare work
 
     def show(self, radiance: F32, view_direct: F32) -> None:
         """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample."""
@@ -312,6 +313,7 @@ class AnyLight:
             sky = self.bins.under(self._alone)
             direct = np.empty((around.gather.n, 3), np.float32)
             of_cells.light(sky, direct)
+            self.following = self.following or Following(around)
             around.bounce(direct, radiance, self.direct, self.following.next_part())
             self.direct = direct
             around.light_view(sky, view_direct)
@@ -328,6 +330,8 @@ class AnyLight:
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """The next part of the cells, then of the view; False after the last."""
         around = self._around
+        if not len(self._cells):
+            self._cells, self._view = (np.zeros((n, 3), np.float32) for n in (around.gather.n, around.view.n))
         if self._cell < around.gather.n:
             if self._samplers:
                 self._light_cells()

@@ -212,7 +212,7 @@ class LiveLights:
         if isinstance(work, AnyLight):
             work.bins = state.bins
         work.direct = state.direct
-        work.following = state.following or work.following
+        work.following = state.following
         work.show(self.radiance[light], self.view_direct[light])
         state.work, state.direct, state.following = work, work.direct, work.following
         state.bins = work.bins if isinstance(work, AnyLight) else None
