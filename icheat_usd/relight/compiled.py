@@ -16,6 +16,7 @@ from icheat_usd.edits.operations import Level, PairCoefficients, PairEnd, Pairs
 from icheat_usd.edits.operations.base import number
 from icheat_usd.edits.operations.hsv import Hsv
 from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels.entries import entries_by_cell
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
 
@@ -138,20 +139,25 @@ def compile_stack(
     acting = np.isin(way, (Way.VERSION, Way.AGGREGATE, Way.PAIRS))
     cells = [found if acts else found[:0] for (found, _), acts in zip(casters, acting, strict=True)]
     support = np.zeros((len(rows), gather.n), np.bool_)
-    slots, slot_begin, slot_of = _slots(rows, way, cells, gather)
-    # Entries by cell, those of one cell in the order of rows.
-    count = np.zeros(gather.n, np.int64)
     for row, there in enumerate(cells):
         support[row, there] = True
-        count[there] += 1
-    begin = np.concatenate([[0], np.cumsum(count)])
-    following, n = begin[:-1].copy(), int(begin[-1])
+    slots, slot_begin = _slots(rows, way, cells, gather)
+    row_begin = np.concatenate([[0], np.cumsum([len(there) for there in cells])]).astype(np.int64)
+    n, begin = int(row_begin[-1]), np.empty(gather.n + 1, np.int64)
     entry_row, entry_weight, entry_slot = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.int32)
-    for row, there in enumerate(cells):
-        place = np.take(following, there)
-        following[there] = place + 1
-        entry_row[place], entry_slot[place] = row, slot_of[row]
-        entry_weight[place] = casters[row][1][: len(there)]
+    entries_by_cell(
+        np.concatenate([np.empty(0, np.int64), *cells]),
+        row_begin,
+        np.concatenate(
+            [np.empty(0, np.float32), *(weights[: len(c)] for (_, weights), c in zip(casters, cells, strict=True))]
+        ),
+        slot_begin[:-1],
+        (np.diff(slot_begin) > 1).astype(np.uint8),
+        begin,
+        entry_row,
+        entry_weight,
+        entry_slot,
+    )
     edit_of = np.concatenate([table[:, 0], table[aggregates, 0]]).astype(np.int64)
     compiled = CompiledStack(
         field,
@@ -200,17 +206,13 @@ def _gives_offset(bound: BoundEdit, key: int) -> bool:
 
 def _slots(
     rows: list[tuple[int, BoundEdit, int]], way: I64, cells: list[I64], gather: GatherSamples
-) -> tuple[F64, I64, list[I64 | int]]:
-    """Numbers of all rows, where those of each begin, and which each row has at its cells: one, or each its own."""
+) -> tuple[F64, I64]:
+    """Numbers of all rows, and where those of each begin: one for all of its cells, or one for each."""
     parts: list[F64] = []
-    slot: list[I64 | int] = []
-    begin = [0]
     for row, (_, bound, key) in enumerate(rows):
-        part = numbers_of(bound, key, gather, cells[row]) if way[row] == Way.VERSION else _IDENTITY
-        slot.append(begin[-1] + np.arange(len(cells[row])) if len(part) > 1 else begin[-1])
-        parts.append(part)
-        begin.append(begin[-1] + len(part))
-    return np.concatenate([np.zeros((0, 9)), *parts]), np.array(begin, np.int64), slot
+        parts.append(numbers_of(bound, key, gather, cells[row]) if way[row] == Way.VERSION else _IDENTITY)
+    begin = np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+    return np.concatenate([np.zeros((0, 9)), *parts]), begin
 
 
 def numbers_of(bound: BoundEdit, key: int, gather: GatherSamples, cells: I64) -> F64:

@@ -170,7 +170,7 @@ class LiveStack:
     def _show_anew(self, stack: EditStack, field: EditField, light_paths: tuple[str, ...]) -> None:
         compiled = self._compiled(field)
         # Some more, for edits to come: memory that is not touched costs nothing.
-        n = compiled.n_rows + max(8, compiled.n_rows // 4)
+        n = compiled.n_rows + max(2, compiled.n_rows // 8)
         masks = np.zeros((n, len(self._points[RECEIVERS].points.instance)), np.float32)
         for _, key, row in _keys(field):
             found = self._weights_of(field.edits[compiled.row_table[row, 0]], key, RECEIVERS)

@@ -42,31 +42,31 @@ def made_version(key: VersionKey, compiled: CompiledStack, products: Products) -
     support, inner = compiled.support, _inner(key, compiled)
     together = support[inner].all(axis=0) if inner else support[list(key.whole)].any(axis=0)
     cells = np.flatnonzero(together).astype(np.int32)
-    by_pairs = any(compiled.way[row] == Way.PAIRS for row in (*key.whole, *inner))
-    return _version(key, compiled, cells, *products.nodes(cells[:0] if by_pairs else cells))
-
-
-def moved_version(version: Version, compiled: CompiledStack, now: I64) -> Version | None:
-    """A version whose rows have other numbers, `now` by row; None if one is gone, or they are in another order."""
-    rows = now[sorted(version.rows)]
-    if len(rows) and (rows.min() < 0 or bool((np.diff(rows) <= 0).any())):
-        return None
-    whole, differ = (tuple(now[list(some)].tolist()) for some in (version.key.whole, version.key.differ))
-    return _version(VersionKey(whole, differ), compiled, version.cells, version.nodes, version.child)
-
-
-def _version(key: VersionKey, compiled: CompiledStack, cells: I32, nodes: I32, child: I32) -> Version:
+    rows = frozenset((*key.whole, *inner))
+    by_pairs = bool((compiled.way[list(rows)] == Way.PAIRS).any())
+    nodes, child = products.nodes(cells[:0] if by_pairs else cells)
     n = len(key.differ)
     subsets = [some for k in range(n + 1) for some in combinations(key.differ, k)]
     sets = np.zeros((len(subsets), len(compiled.edit_of)), np.uint8)
     for row, some in enumerate(subsets):
         sets[row, list(key.whole + some)] = 1
     sign = np.array([(-1.0) ** (n - len(some)) for some in subsets])
-    rows = frozenset((*key.whole, *_inner(key, compiled)))
     unedited = not key.differ and key.restrict < 0
     restrict = (key.restrict, unedited, key.reach, bool(compiled.gives_offset[list(rows)].any()))
-    by_pairs = any(compiled.way[row] == Way.PAIRS for row in rows)
     return Version(key, cells, nodes, child, sets, sign, restrict, rows, by_pairs)
+
+
+def moved_version(version: Version, compiled: CompiledStack, now: I64) -> Version | None:
+    """A version whose rows have other numbers, `now` by row; None if one is gone, or they are in another order."""
+    old = sorted(version.rows)
+    rows = now[old]
+    if len(rows) and (rows.min() < 0 or bool((rows[1:] <= rows[:-1]).any())):
+        return None
+    number = dict(zip(old, rows.tolist(), strict=True))
+    whole, differ = (tuple(number[row] for row in some) for some in (version.key.whole, version.key.differ))
+    sets = np.zeros((len(version.sets), len(compiled.edit_of)), np.uint8)
+    sets[:, rows] = version.sets[:, old]
+    return version._replace(key=VersionKey(whole, differ), sets=sets, rows=frozenset(number.values()))
 
 
 def _inner(key: VersionKey, compiled: CompiledStack) -> list[int]:
