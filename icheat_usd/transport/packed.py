@@ -217,7 +217,8 @@ class LargeTerms:
         return float(max(by_error, self._least(terms, max_bytes)))
 
     def _terms(self, size: F32) -> F32:
-        terms: F32 = np.where(self._index == 0, np.float32(np.inf), np.take(size, self._index) * self._worth)
+        of_roots = np.append(np.float32(0), size[1:])  # which may be infinite, times a worth of 0
+        terms: F32 = np.where(self._index == 0, np.float32(np.inf), np.take(of_roots, self._index) * self._worth)
         return terms  # roots stay
 
     def _least(self, terms: F32, max_bytes: int) -> float:
