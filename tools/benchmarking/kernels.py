@@ -154,6 +154,18 @@ def _products(packed: PackedTransport, b: F32) -> list[_Product]:
     return products
 
 
+def one_matrix(packed: PackedTransport) -> tuple[PackedRows, int]:
+    """Tiles of all lobes as rows of one matrix; of large transports every k-th, and k."""
+    lobes = [lobe.rows for lobe in packed.lobes if len(lobe.rows.index) and lobe.rows.value.dtype == np.int8]
+    step = -(-sum(len(rows.index) for rows in lobes) * LANES // _MOST_ENTRIES)
+    tiles = [rows.tiles(tile, tile + 1) for rows in lobes for tile in range(0, rows.n_tiles, max(step, 1))]
+    begin = np.concatenate([[0], np.cumsum([len(tile.index) for tile in tiles])]).astype(np.int64)
+    columns = {
+        name: np.concatenate([getattr(tile, name) for tile in tiles]) for name in ("index", "scale", "worth", "value")
+    }
+    return replace(lobes[0], n_rows=len(tiles) * LANES, tile_begin=begin, **columns), step
+
+
 def dequantised(rows: PackedRows) -> SparseRows:
     """Packed rows as a sparse matrix of Haar coefficients, without those that are 0."""
     n_tiles = len(rows.tile_begin) - 1
@@ -234,9 +246,10 @@ def per_pixel(packed: PackedTransport) -> SparseRows | None:
     """Interpolation times records of the first lobe, or None where that has too many entries to hold."""
     from scipy.sparse import csr_matrix
 
-    spread_rows, records = packed.interpolation, dequantised(packed.lobes[0].rows)
-    if spread_rows is None:
+    spread_rows = packed.interpolation
+    if spread_rows is None or len(packed.lobes[0].rows.index) * LANES > _MOST_ENTRIES:
         return None
+    records = dequantised(packed.lobes[0].rows)
     counts = np.diff(records.indptr)
     bound = int(counts[spread_rows.indices].sum())
     if bound > 4 * _MOST_ENTRIES:
@@ -255,7 +268,9 @@ def per_pixel(packed: PackedTransport) -> SparseRows | None:
 
 
 def measure_product(packed: PackedTransport, b: F32, rounds: int = 21) -> dict[str, Any]:
-    """Our product, its peers' and reading, for all records of all lobes.
+    """Our product, its peers' and reading, for the records of all lobes as one matrix.
+
+    Of matrices with more entries than peers have memory for, every k-th tile is taken, by all contenders.
 
     Parameters
     ----------
@@ -266,29 +281,27 @@ def measure_product(packed: PackedTransport, b: F32, rounds: int = 21) -> dict[s
     -------
     ``timings`` (see `Timing`), and per number of threads in ``summary``: our best product, the share of the
     time that reading its bytes takes, the best peer and how many times longer that one took. ``difference``
-    is ours to the peers' result, relative to it.
+    is ours to the peers' result, relative to it; ``every_tile`` is k.
     """
-    products = _products(packed, b)
-    n_bytes = sum(item.rows.n_bytes for item in products)
+    if not any(len(lobe.rows.index) and lobe.rows.value.dtype == np.int8 for lobe in packed.lobes):
+        return {"timings": [], "summary": [], "difference": {}, "bytes": 0, "every_tile": 1}
+    rows, step = one_matrix(packed)
+    (item,) = _products(replace(packed, lobes=(replace(packed.lobes[0], rows=rows),)), b)
+    n_bytes = rows.n_bytes
     read = reading(n_bytes)
     contenders: dict[tuple[str, int], tuple[Work, int]] = {}
     for threads in (1, 2):
-        contenders["ours, float sums", threads] = (lambda: [item.in_floats() for item in products], n_bytes)
-        contenders["ours, integer sums", threads] = (lambda: [item.in_integers() for item in products], n_bytes)
+        contenders["ours, float sums", threads] = (item.in_floats, n_bytes)
+        contenders["ours, integer sums", threads] = (item.in_integers, n_bytes)
         contenders["reading as many bytes", threads] = (read, n_bytes)
+    matrix, light = dequantised(rows), np.ascontiguousarray(item.coefficients[0, :, :3])
+    contenders |= _scipy_peers(matrix, light, "of records") | _mkl_peers(matrix, light, "of records")
     differences = {}
-    for number, item in enumerate(products):
-        label = "of records" if number == 0 else f"of records, lobe {number}"
-        matrix, light = dequantised(item.rows), np.ascontiguousarray(item.coefficients[0, :, :3])
-        if matrix.n_entries > _MOST_ENTRIES:
-            continue
-        contenders |= _scipy_peers(matrix, light, label) | _mkl_peers(matrix, light, label)
-        for name, work in (("floats", item.in_floats), ("integers", item.in_integers)):
-            work()
-            differences[f"{label}, {name}"] = _difference(item, matrix.matmul(light))
+    for name, work in (("floats", item.in_floats), ("integers", item.in_integers)):
+        work()
+        differences[name] = _difference(item, matrix.matmul(light))
     pixels = per_pixel(packed)
-    if pixels is not None and products:
-        light = np.ascontiguousarray(products[0].coefficients[0, :, :3])
+    if pixels is not None:
         contenders |= _scipy_peers(pixels, light, "of pixels") | _mkl_peers(pixels, light, "of pixels")
     timings = time_in_turns(contenders, rounds)
     return {
@@ -296,6 +309,8 @@ def measure_product(packed: PackedTransport, b: F32, rounds: int = 21) -> dict[s
         "summary": [_summary(timings, threads) for threads in (1, 2)],
         "difference": differences,
         "bytes": n_bytes,
+        "entries": matrix.n_entries,
+        "every_tile": step,
     }
 
 
@@ -380,11 +395,11 @@ def _difference(item: _Product, expected: F32) -> float:
 
 
 def _summary(timings: list[Timing], threads: int) -> dict[str, Any]:
-    """Ours, reading and the best peer for the records of the first lobe."""
+    """Ours, reading and the best peer for the same matrix."""
     of = [timing for timing in timings if timing.threads == threads]
     ours = min((t for t in of if t.name.startswith("ours")), key=lambda t: t.median)
     read = next(t for t in of if t.name.startswith("reading"))
-    peers = [t for t in of if "of records," in t.name and "lobe" not in t.name]
+    peers = [t for t in of if "of records," in t.name]
     result: dict[str, Any] = {
         "threads": threads,
         "ours": ours.name,

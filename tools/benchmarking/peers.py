@@ -36,6 +36,8 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
         lines.append(f"| {name}, {threads} | " + " | ".join(cells) + " |")
     lines.append("")
     for stage, result in found:
+        if not result["timings"]:
+            continue
         for summary in result["summary"]:
             peer = ""
             if "best_peer" in summary:
@@ -44,6 +46,9 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
                 f"{stage}, threads {summary['threads']}: {100 * summary['share_of_read_speed']:.0f} % of the speed of"
                 f" reading ({summary['read_GB/s']:.0f} GB/s){peer}."
             )
+        part = f", every {result['every_tile']}th tile" if result["every_tile"] > 1 else ""
+        off = ", ".join(f"{name} {value:.1e}" for name, value in result["difference"].items())
+        lines.append(f"{stage}: {result['entries'] / 1e6:.0f} million entries{part}; ours differs by {off}.")
     return lines
 
 
