@@ -25,6 +25,7 @@ _LASTING = 12
 
 # Another step if the light was out of balance by more than this share before the last; each takes away most of it.
 _UNBALANCED = 0.02
+_FAR = 0.1  # of all cells, if it was by more than this
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ class QuickBounces:
             lacking, light = self._step(direct, part, out)
             if lacking <= _UNBALANCED * light:
                 break
-            part = (part[0] + part[1] // 2) % part[1], part[1]
+            part = _ALL if lacking > _FAR * light else ((part[0] + part[1] // 2) % part[1], part[1])
         return out
 
     def _take_change(self, radiance: F32, before: F32, direct: F32) -> tuple[F32, F32]:
