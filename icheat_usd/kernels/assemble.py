@@ -20,6 +20,8 @@ from icheat_usd.kernels.simd import (
     load_rgb,
     multiply_add,
     plus,
+    positive,
+    positive_color,
     scale_add,
     store,
     store_color,
@@ -80,6 +82,11 @@ def _add_group(at, i, place):  # type: ignore[no-untyped-def]
 def _indirect_run(first, n, table, products, out):  # type: ignore[no-untyped-def]
     """Indirect light of `n` view samples to an address, three floats each; one more is written."""
     row, weight, tint, lobe, more_view, more_row, more_weight, more_tint, more_lobe = table
+    if len(products) == 0:
+        for _ in range(n):
+            store_rgb(out, black())
+            out += 12
+        return
     _blend_run(_places(row, weight, tint, lobe, products), first, n, out)
     more = _places(more_row, more_weight, more_tint, more_lobe, products)
     for m in range(np.searchsorted(more_view, first), np.searchsorted(more_view, first + n)):
@@ -130,31 +137,20 @@ def assemble_view(table, products, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _replace_run(first, n, own_view, own, touched, sent):  # type: ignore[no-untyped-def]
-    """Put the indirect light that some of `n` view samples have of their own, and hold that of edited ones at 0."""
+def _replace_run(first, n, own_view, own, sent):  # type: ignore[no-untyped-def]
+    """Put the indirect light that some of `n` view samples have of their own."""
     for k in range(np.searchsorted(own_view, first), np.searchsorted(own_view, first + n)):
         v = np.int64(own_view[k])
         for c in range(3):
             sent[v - first, c] = own[v, c]
-    if len(touched) == 0:
-        return
-    n_touched = 0
-    for i in range(n):
-        n_touched += touched[first + i]
-    if n_touched == n:
-        values = sent.reshape(-1)
-        for i in range(3 * n):
-            values[i] = values[i] if values[i] > 0 else np.float32(0.0)
-    elif n_touched > 0:
-        for i in range(n):
-            if touched[first + i]:
-                for c in range(3):
-                    sent[i, c] = sent[i, c] if sent[i, c] > 0 else np.float32(0.0)
 
 
 @kernel
 def _add_direct(first, n, direct, indirect, out):  # type: ignore[no-untyped-def]
-    """Indirect light, from its address, and direct light of `n` view samples to `out`, which may be the same."""
+    """Indirect light, from its address, held at 0 or above, and direct light of `n` view samples to `out`.
+
+    It may be the same address.
+    """
     kept, lights, gains = direct
     some = address_of(kept) + 12 * first
     light_0 = address_of(lights) + 12 * first
@@ -169,7 +165,7 @@ def _add_direct(first, n, direct, indirect, out):  # type: ignore[no-untyped-def
                 total = multiply_add(load(light), load(gain), total)
                 light += step
                 gain += 192
-            store(out + 64 * third, plus(load(indirect + 64 * third), total))
+            store(out + 64 * third, plus(positive(load(indirect + 64 * third)), total))
         some += 192
         light_0 += 192
         indirect += 192
@@ -181,7 +177,7 @@ def _add_direct(first, n, direct, indirect, out):  # type: ignore[no-untyped-def
             one = color_add(load_rgb(light), load_rgb(gain), one)
             light += step
             gain += 192
-        store_rgb(out, scale_add(load_rgb(indirect), np.float32(1.0), one))
+        store_rgb(out, scale_add(positive_color(load_rgb(indirect)), np.float32(1.0), one))
         some += 12
         light_0 += 12
         indirect += 12
@@ -237,7 +233,7 @@ def _sum_samples(begin, end, sample_begin, sent, film):  # type: ignore[no-untyp
 
 @kernel
 def _film_chunk(begin, end, table, products, own, direct, seen, in_order, film):  # type: ignore[no-untyped-def]
-    own_view, own_light, touched = own
+    own_view, own_light = own
     dimmed_view, throughput, sample_begin, _, still_pixel, still = seen
     base = address_of(film)
     first = np.int64(sample_begin[begin])
@@ -245,7 +241,7 @@ def _film_chunk(begin, end, table, products, own, direct, seen, in_order, film):
     buffer = np.empty(3 * n + 1, np.float32)
     indirect = address_of(buffer)
     _indirect_run(first, n, table, products, indirect)
-    _replace_run(first, n, own_view, own_light, touched, buffer[: 3 * n].reshape(n, 3))
+    _replace_run(first, n, own_view, own_light, buffer[: 3 * n].reshape(n, 3))
     if in_order:
         _add_direct(first, n, direct, indirect, base + 12 * begin)
         _dim(first, n, dimmed_view, throughput, film[begin:end])
@@ -272,9 +268,8 @@ def assemble_film(table, products, own, direct, seen, film):  # type: ignore[no-
     Parameters
     ----------
     own
-        ``(own_view, own_light, touched)``: (n_own,) int32 view samples, ascending, whose indirect light is not
-        interpolated; theirs, (n_view, 3) float32; and which view samples' indirect light is held at 0 or above,
-        (n_view,) or (0,) bool.
+        ``(own_view, own_light)``: (n_own,) int32 view samples, ascending, whose indirect light is not interpolated, and
+        theirs, (n_view, 3) float32.
     direct
         ``(kept, lights, gains)``: the sum of the first lights' reflected direct light, (n_view, 3) or (0, 3);
         that of each of the others at gain 1, (n_lights, n_view, 3); and their gains, each 16 times, (n_lights, 48).
@@ -287,7 +282,8 @@ def assemble_film(table, products, own, direct, seen, film):  # type: ignore[no-
 
     Notes
     -----
-    A pixel's sums run in one order: the same bits for any number of threads.
+    A pixel's sums run in one order: the same bits for any number of threads. Indirect light is held at 0 or above,
+    once, at the end: packed rows and edits that take light away may say less.
     """
     n = len(film)
     in_order = seen[3]

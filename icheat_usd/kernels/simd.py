@@ -155,6 +155,12 @@ def larger(builder: Any, values: Any) -> Any:
     return _larger_size(builder, values[0], values[1], _I16X)
 
 
+@_operation(floats, floats)
+def positive(builder: Any, values: Any) -> Any:
+    """What is above 0, and 0 in the other places."""
+    return _positive(builder, values[0])
+
+
 @_operation(types.float32, floats)
 def total(builder: Any, values: Any) -> Any:
     """Sum of all 16, in halves."""
@@ -165,6 +171,11 @@ def total(builder: Any, values: Any) -> Any:
 def peak(builder: Any, values: Any) -> Any:
     """The largest of all 16, of which none is below 0."""
     return _halved(builder, values[0], lambda a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
+
+
+def _positive(builder: Any, value: Any) -> Any:
+    zero = ir.Constant(value.type, [0.0] * value.type.count)
+    return builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
 
 
 def _halved(builder: Any, value: Any, combine: Any) -> Any:
@@ -255,6 +266,12 @@ def weighted_sum(builder: Any, values: Any) -> Any:
         value = _load(builder, builder.add(values[0], offset), _F4X)
         total = _call(builder, "llvm.fmuladd.v4f32", _F4X, value, weight, total)
     return total
+
+
+@_operation(color, color)
+def positive_color(builder: Any, values: Any) -> Any:
+    """What is above 0, and 0 in the other channels."""
+    return _positive(builder, values[0])
 
 
 @_operation(color, color, types.float32)

@@ -113,7 +113,8 @@ class LiveRelighter:
         self._exact_products: Products | None = None
         self._n_exact = 0  # tiles of exact rows that the unedited light has
         self._narrow: Narrow | None = None
-        if exact is not None and exact is not transport:
+        # Where no gather ray meets a surface, there are no rows, and packing loses nothing.
+        if exact is not None and exact is not transport and self._products.names:
             self._exact_products = Products(exact, self.gather.tree, self._products.names)
             self._narrow = Narrow(self._products, self._exact_products)
         # Uncompressed means exact: what is interpolated is then the transport alone, not what edits make of it.
@@ -240,9 +241,10 @@ class LiveRelighter:
         self._update()
         lights = self.lights
         direct = self._direct.now(lights.view_direct, lights.gains, getattr(lights, "light_moves", None))
-        film = image.reshape(-1, 3) if image.flags.c_contiguous else np.empty((shape[0] * shape[1], 3), np.float32)
+        is_flat = image.flags.c_contiguous
+        film = image.reshape(-1, 3) if is_flat else np.empty((shape[0] * shape[1], 3), np.float32)
         self._shared.film(self._own_light, direct, self._seen, film)
-        if film.base is not image and film is not image:
+        if not is_flat:
             image[:] = film.reshape(shape)
         return image
 
@@ -253,8 +255,8 @@ class LiveRelighter:
         self._shared.edited(edited)
         edited[self._mixed_samples] = self._own[self._mixed_samples]
         # Held at 0 or above once, at the end, as in the film.
-        held = np.where(self._touched[:, None], np.maximum(edited, np.float32(0)), edited)
-        return RelitView(np.ascontiguousarray(self.lights.direct(), np.float32), self._unedited().copy(), held)
+        unedited, edited = (np.maximum(light, np.float32(0)) for light in (self._unedited(), edited))
+        return RelitView(np.ascontiguousarray(self.lights.direct(), np.float32), unedited, edited)
 
     def refine(self) -> bool:
         """At rest: bring lights to their final quality, then take back what packing lost; False when nothing is left.
@@ -345,7 +347,6 @@ class LiveRelighter:
         self._samples_of: dict[frozenset[int], I64] = {}
         self._mixed: Bool = np.zeros(self.view.n, np.bool_)
         self._alone: Bool = np.zeros(self.view.n, np.bool_)
-        self._touched: Bool = np.zeros(self.view.n, np.bool_)
         self._most_groups = self._most_versions = sys.maxsize
         self._place(np.flatnonzero(self._touched_by(range(len(stack.mask_rows)))))
         self._most_groups = 2 * len(self._groups.terms) + SPARE_GROUPS
@@ -386,13 +387,10 @@ class LiveRelighter:
         self._versions.need(needed)
         self._shared.place(samples, groups, np.append(self._terms.shared, False))
         group = groups.of_sample[samples]
-        self._touched[samples] = group >= 0
         self._mixed[samples] = ~np.append(self._terms.shared, True)[group]
         self._alone[samples] = np.append(self._terms.alone, False)[group]
         self._mixed_samples = np.flatnonzero(self._mixed)
-        # The others keep their unedited light, bit for bit.
-        held = self._touched if self._touched.any() else self._touched[:0]
-        self._own_light = OwnLight(self._mixed_samples.astype(np.int32), self._own, held)
+        self._own_light = OwnLight(self._mixed_samples.astype(np.int32), self._own)
         alone = np.flatnonzero(self._alone)
         self._alone_samples: AloneSamples | None = None
         self._alone_difference: F32 = np.zeros((self.view.n if len(alone) else 0, 3), np.float32)
@@ -500,15 +498,7 @@ class LiveRelighter:
 
     def _edit(self, samples: I64) -> None:
         """Find the light of those of some samples that do not share theirs."""
-        if not len(self._mixed_samples):
-            return
         samples = samples[self._mixed[samples]]
-        idle = samples[~self._touched[samples]]
-        if len(idle):
-            self._own[idle] = self._unedited()[idle]
-        self._edit_mixed(samples[self._touched[samples]])
-
-    def _edit_mixed(self, samples: I64) -> None:
         if not len(samples):
             return
         light = np.take(self._unedited(), samples, axis=0)

@@ -25,7 +25,6 @@ class OwnLight(NamedTuple):
 
     samples: I32  #: ascending
     light: F32  #: (n_view, 3)
-    touched: Bool  #: (n_view,) or (0,) if none is
 
 
 class SeenSamples(NamedTuple):
