@@ -45,6 +45,8 @@ def allot_rays(
         Rays per row, of both kinds together.
     """
     n_view, n_rows = spread.shape
+    if not n_rows:
+        return Counts(np.zeros(0, np.int64), np.zeros(0, np.int64))
     owner = np.repeat(np.arange(n_view), np.diff(spread.indptr))
     image = np.zeros((n_view, lights.shape[1]), np.float32)
     seen, variances = [], []

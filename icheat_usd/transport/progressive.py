@@ -64,6 +64,7 @@ def build_transports(
         While records are placed, with few rays that all rows share, as noise
         they move slowly over a surface instead of from record to record; then
         with rays of their own. Rows are in the order of `tile_order`.
+        There is one without rows where the camera sees no surface.
 
     Raises
     ------
@@ -76,6 +77,13 @@ def build_transports(
     """
     if rays_per_row > MOST_RAYS:
         raise IcheatError(f"{rays_per_row} gather rays a row are more than records can have; take {MOST_RAYS} at most")
+    if not view.n:
+        none = np.empty(0, np.int64)
+        rows = SparseRows.empty(0, gather.n)
+        yield _transport(
+            view, none.astype(np.int32), SparseRows.empty(0, 0), [rows] * 3, seed, None, Counts(none, none)
+        )
+        return
     builder = RowBuilder(snapshot, tracer, gather, seed)
     lights = np.ascontiguousarray(training.T)
     share = _scalar(view.throughput) * np.float32(

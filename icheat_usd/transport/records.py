@@ -326,7 +326,7 @@ def _apply(interpolation: SparseRows, samples: I64, response: F32) -> F32:
     """Interpolated responses of some samples: (2, n_lobes, n, n_lights)."""
     begin, end = interpolation.indptr[samples], interpolation.indptr[samples + 1]
     out = np.zeros((*response.shape[:2], len(samples), response.shape[3]), np.float32)
-    for k in range(int((end - begin).max())):
+    for k in range(int((end - begin).max(initial=0))):
         has = np.flatnonzero(begin + k < end)
         entry = begin[has] + k
         out[:, :, has] += interpolation.weights[entry][:, None] * response[:, :, interpolation.indices[entry]]

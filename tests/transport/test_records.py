@@ -201,6 +201,13 @@ def test_allotted_rays_leave_less_noise_than_as_many_for_each_row() -> None:
     assert allotted < 0.7 * uniform  # 0.58 with counts that are no powers of two
 
 
+def test_no_rows_are_allotted_no_rays() -> None:
+    none = SparseRows.empty(0, 4)
+    tint, light = np.zeros(0, np.float32), np.ones((4, 2), np.float32)
+    counts = allot_rays([none] * 3, [tint] * 3, SparseRows.empty(0, 0), light, np.empty(0, np.int64), 1024)
+    assert counts.diffuse.shape == counts.specular.shape == (0,)
+
+
 def test_placement_has_the_same_bits_for_any_number_of_threads() -> None:
     scene = floor_scene()
     view = view_of(scene)
