@@ -72,7 +72,8 @@ class LiveFrames:
         self._failed: dict[tuple[float | None, Level], Exception] = {}
         self._building: dict[tuple[float | None, Level], ShotParts] = {}
         self._building_version = 0  #: of the lights in `_building`
-        self._job: tuple[float | None, Level] = (None, Level.NONE)
+        self._asked: tuple[float | None, Level] = (None, Level.NONE)  #: what the background is to make
+        self._job = self._asked  #: what it makes for that, which may be better
         start_workers()
         self._background = Background(self._next_job, self._on_error, kernels_may_overlap)
         self._background.start()
@@ -221,7 +222,9 @@ class LiveFrames:
             reached = Level.NONE if entry is None else entry.level
             if (frame, level) in self._failed or reached.reaches(level):
                 continue
-            self._job = frame, level
+            if level is Level.REST and reached is not Level.FULL:
+                continue  # what comes before it has failed
+            self._asked = self._job = frame, level
             if level is Level.REST:
                 return lambda frame=frame: self._refine(frame)  # type: ignore[misc]
             return lambda frame=frame, level=level: self._make(frame, level)  # type: ignore[misc]
@@ -380,7 +383,7 @@ class LiveFrames:
         return next((error for (frame, _), error in self._failed.items() if frame == playhead), None)
 
     def _on_error(self, error: Exception) -> None:
-        self._failed[self._job] = error
+        self._failed[self._asked] = self._failed[self._job] = error
         self._forget_parts(self._job[0], *Level)
         self._tell(LiveEvent("error", self._job[0], self._job[1], error=error))
 

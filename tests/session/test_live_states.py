@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.session import Quality, Session, shot_parts
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_events import LiveEvent
+from icheat_usd.session.live_frames import LiveFrames
 from icheat_usd.session.live_state import UNCHANGED
 from tests.session.test_session import ROOM
 
@@ -37,6 +39,14 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def open_live(stage: Path) -> LiveSession:
     return LiveSession.open(stage, width=20, height=15, quality=QUALITY)
+
+
+def pulsing(stage: Path) -> Path:
+    """The stage with a light that differs at frames 1 and 2."""
+    path = stage.with_name("pulsing.usda")
+    samples = "float inputs:intensity.timeSamples = { 1: 20, 2: 10 }"
+    path.write_text(stage.read_text().replace("float inputs:intensity = 20", samples))
+    return path
 
 
 def within(seconds: float, act: Callable[[], object]) -> None:
@@ -143,13 +153,8 @@ def test_frames_that_share_rows_need_no_coarse_ones(stage: Path, monkeypatch: py
         return build(*given, row_spacing=row_spacing, **values)
 
     monkeypatch.setattr(shot_parts, "build_transport", counted)
-    text = stage.read_text().replace(
-        "float inputs:intensity = 20", "float inputs:intensity.timeSamples = { 1: 20, 2: 10 }"
-    )
-    path = stage.with_name("pulsing.usda")
-    path.write_text(text)
     heard: list[tuple[float | None, str]] = []
-    with LiveSession.open(path, width=20, height=15, quality=QUALITY, frame=1.0) as live:
+    with LiveSession.open(pulsing(stage), width=20, height=15, quality=QUALITY, frame=1.0) as live:
         live.listen(lambda event: heard.append((event.frame, str(event.level))) if event.kind == "better" else None)
         first = live.frame(level="rest")
         live.scrub(2.0)
@@ -157,6 +162,38 @@ def test_frames_that_share_rows_need_no_coarse_ones(stage: Path, monkeypatch: py
     assert made == [8, 1]
     assert (1.0, "preview") in heard and (2.0, "preview") not in heard[heard.index((2.0, "full")) :]
     np.testing.assert_allclose(second, first / 2, rtol=1e-3, atol=1e-5)
+
+
+def test_a_frame_that_cannot_be_shown_is_tried_once(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though it is made in full where a coarse one was asked for, as it shares the rows of another frame."""
+    show, asked = LiveFrames._show, LiveFrames._next_job
+    n_asked = 0
+
+    def refused(frames: LiveFrames, number: float | None, *rest: object) -> None:
+        if number == 2.0:
+            raise EditError("does not fit frame 2")
+        show(frames, number, *rest)  # type: ignore[arg-type]
+
+    def counted(frames: LiveFrames) -> object:
+        nonlocal n_asked
+        n_asked += 1
+        return asked(frames)
+
+    monkeypatch.setattr(LiveFrames, "_show", refused)
+    monkeypatch.setattr(LiveFrames, "_next_job", counted)
+    errors: list[LiveEvent] = []
+    with LiveSession.open(pulsing(stage), width=20, height=15, quality=QUALITY, frame=1.0) as live:
+        live.wait("rest")
+        live.listen(lambda event: errors.append(event) if event.kind == "error" else None)
+        live.scrub(2.0)
+        with pytest.raises(EditError, match="does not fit frame 2"):
+            live.frame()
+        time.sleep(0.5)
+        known = len(errors), n_asked
+        time.sleep(0.5)
+        assert (len(errors), n_asked) == known and len(errors) <= 2, "the background has nothing to do"
+        live.scrub(1.0)
+        assert live.wait("rest", timeout=60)
 
 
 def test_surfaces_are_shown_before_there_is_light(stage: Path) -> None:
