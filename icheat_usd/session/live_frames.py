@@ -73,7 +73,7 @@ class LiveFrames:
         self._building: dict[tuple[float | None, Level], ShotParts] = {}
         self._building_version = 0  #: of the lights in `_building`
         self._asked: tuple[float | None, Level] = (None, Level.NONE)  #: what the background is to make
-        self._job = self._asked  #: what it makes for that, which may be better
+        self._job: tuple[float | None, Level] = self._asked  #: what it makes for that, which may be better
         start_workers()
         self._background = Background(self._next_job, self._on_error, kernels_may_overlap)
         self._background.start()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 from icheat_usd.session.kept_states import KeptState, StateShelf
@@ -32,7 +33,8 @@ class LiveHistory:
     """Done and undone steps. A step that cannot be taken back stays where it is.
 
     Steps share what their masks have in common. The oldest are forgotten when
-    there are too many of them, or when they take too much memory.
+    there are too many of them, or when they take too much memory; those since
+    a mark become one, so that it leads back to there however long it gets.
     """
 
     def __init__(self, most_bytes: int = _MOST_BYTES) -> None:
@@ -41,6 +43,7 @@ class LiveHistory:
         self._done: list[_KeptStep] = []
         self._undone: list[_KeptStep] = []
         self._n_forgotten = 0
+        self._marks: list[int] = []  #: that are not joined yet
 
     @property
     def bytes(self) -> int:
@@ -53,23 +56,21 @@ class LiveHistory:
         self._undone = []
         self._done.append(self._kept(step))
         while len(self._done) > 1 and (len(self._done) > _LONGEST or self.bytes > self._most_bytes):
-            self._forget([self._done.pop(0)])
-            self._n_forgotten += 1
+            self._shorten()
 
     def mark(self) -> int:
-        """A place in the history, for `join`."""
-        return self._n_forgotten + len(self._done)
+        """A place in the history; `join` it in any case."""
+        mark = self._n_forgotten + len(self._done)
+        self._marks.append(mark)
+        return mark
 
     def join(self, mark: int, label: str) -> None:
         """Make one step of all that were added since."""
+        self._marks.remove(mark)
         first = max(0, mark - self._n_forgotten)
         steps = self._done[first:]
         if steps:
-            written = tuple(pair for step in steps for pair in step.written)
-            is_about_lights = any(step.is_about_lights for step in steps)
-            before, after = steps[0].before.whole(), steps[-1].after.whole()
-            self._done[first:] = [self._kept(Step(label, before, after, written, is_about_lights))]
-            self._forget(steps)
+            self._done[first:] = [self._joined(steps, label)]
 
     def undo(self, go: Callable[[LiveState, Written, bool], None]) -> str | None:
         """Have `go` bring back what was before the last step; its label, or None."""
@@ -88,6 +89,23 @@ class LiveHistory:
         go(step.after.whole(), step.written, step.is_about_lights)
         self._done.append(self._undone.pop())
         return step.label
+
+    def _shorten(self) -> None:
+        """Have one step less."""
+        if self._marks and min(self._marks) <= self._n_forgotten:
+            self._done[:2] = [self._joined(self._done[:2], self._done[1].label)]
+        else:
+            self._forget([self._done.pop(0)])
+        self._n_forgotten += 1
+
+    def _joined(self, steps: Sequence[_KeptStep], label: str) -> _KeptStep:
+        """All of these steps as one; what lies between them is forgotten."""
+        for step, following in pairwise(steps):
+            self._shelf.forget(step.after)
+            self._shelf.forget(following.before)
+        written = tuple(pair for step in steps for pair in step.written)
+        is_about_lights = any(step.is_about_lights for step in steps)
+        return _KeptStep(label, steps[0].before, steps[-1].after, written, is_about_lights)
 
     def _kept(self, step: Step) -> _KeptStep:
         before, after = self._shelf.keep(step.before), self._shelf.keep(step.after)

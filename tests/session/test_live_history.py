@@ -115,6 +115,31 @@ def test_memory_is_given_back_with_the_steps_that_needed_it() -> None:
     assert painter.history.bytes == 0
 
 
+def test_a_gesture_leads_back_to_where_it_began_however_long_it_is() -> None:
+    painter = Painter(LiveHistory())
+    painter.do(UNCHANGED.with_edit("/e", amount=-1.0), "before")
+    start, mark = painter.state, painter.history.mark()
+    for k in range(600):
+        painter.do(painter.state.with_edit("/e", amount=float(k)), "amount")
+    painter.history.join(mark, "drag")
+    end = painter.state
+    assert painter.history.undo(painter.go) == "drag" and painter.state.edits == start.edits
+    assert painter.history.redo(painter.go) == "drag" and painter.state.edits == end.edits
+
+
+def test_a_gesture_that_takes_too_much_memory_leads_back_too() -> None:
+    rng = np.random.default_rng(3)
+    painter = Painter(LiveHistory(most_bytes=5 * _MASK // 2))
+    painter.paint(rng.uniform(0, 1, (_FACES, 16, 16)).astype(np.float32))
+    mark = painter.history.mark()
+    for _ in range(6):
+        painter.paint(rng.uniform(0, 1, (_FACES, 16, 16)).astype(np.float32))
+        assert painter.history.bytes <= 5 * _MASK // 2
+    painter.history.join(mark, "stroke")
+    assert painter.history.undo(painter.go) == "stroke" and painter.digest == painter.digests[0]
+    assert painter.history.undo(painter.go) is None
+
+
 def test_a_step_over_two_layers_is_undone_as_a_whole_or_not_at_all(stage: Path) -> None:  # noqa: F811
     with open_live(stage) as live:
         with live.gesture("both"):
