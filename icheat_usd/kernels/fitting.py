@@ -31,9 +31,24 @@ def _see(response, gloss_of, gloss, tint, light, v, at, out):  # type: ignore[no
 
 @kernel
 def _find(  # type: ignore[no-untyped-def]
-    v, pixel, shape, position, normal, extent, bucket_side, bucket_begin, bucket_record, record_view, n, record
+    v,
+    pixel,
+    shape,
+    position,
+    normal,
+    instance,
+    extent,
+    bucket_side,
+    bucket_begin,
+    bucket_record,
+    record_view,
+    n,
+    record,
 ):
-    """Append the nearest records to the `n` that a sample has, up to `MOST`; how many there are then."""
+    """Append the nearest records on the same object to the `n` that a sample has, up to `MOST`; their number then.
+
+    Others may lie behind a wall: that many lights show them alike is no proof that the next one does.
+    """
     near, best = np.full(MOST, np.float32(np.inf)), np.full(MOST, np.int64(-1))
     height, width = shape
     n_x, n_y = (width + bucket_side - 1) // bucket_side, (height + bucket_side - 1) // bucket_side
@@ -44,6 +59,8 @@ def _find(  # type: ignore[no-untyped-def]
             for e in range(bucket_begin[place], bucket_begin[place + 1]):
                 r = bucket_record[e]
                 w = record_view[r]
+                if instance[w] != instance[v]:
+                    continue
                 cosine = normal[v, 0] * normal[w, 0] + normal[v, 1] * normal[w, 1] + normal[v, 2] * normal[w, 2]
                 if cosine < _LEAST_COSINE:
                     continue
@@ -139,6 +156,7 @@ def _fit_one(  # type: ignore[no-untyped-def]
     shape,
     position,
     normal,
+    instance,
     extent,
     bucket_side,
     bucket_begin,
@@ -162,7 +180,19 @@ def _fit_one(  # type: ignore[no-untyped-def]
         record[n], start[n] = indices[e], weights[e]
         n += 1
     n = _find(
-        v, pixel, shape, position, normal, extent, bucket_side, bucket_begin, bucket_record, record_view, n, record
+        v,
+        pixel,
+        shape,
+        position,
+        normal,
+        instance,
+        extent,
+        bucket_side,
+        bucket_begin,
+        bucket_record,
+        record_view,
+        n,
+        record,
     )
     size = response.shape[1] * response.shape[2]
     want, seen = np.empty(size, np.float32), np.empty((MOST, size), np.float32)
@@ -184,6 +214,7 @@ def fit_weights(  # type: ignore[no-untyped-def]
     shape,
     position,
     normal,
+    instance,
     extent,
     bucket_side,
     bucket_begin,
@@ -201,14 +232,14 @@ def fit_weights(  # type: ignore[no-untyped-def]
     out_record,
     out_weight,
 ):
-    """Records and weights of some view samples, from those that they have and others near.
+    """Records and weights of some view samples, from those that they have and others near on the same object.
 
     Parameters
     ----------
     samples : (n,)
     indptr, indices, weights
         Interpolation of all view samples.
-    pixel, position, normal, extent, record_view, bucket_side, bucket_begin, bucket_record
+    pixel, position, normal, instance, extent, record_view, bucket_side, bucket_begin, bucket_record
         As for `record_weights`.
     shape
         Height and width of the image, pixels.
@@ -233,6 +264,7 @@ def fit_weights(  # type: ignore[no-untyped-def]
             shape,
             position,
             normal,
+            instance,
             extent,
             bucket_side,
             bucket_begin,

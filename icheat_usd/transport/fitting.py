@@ -21,9 +21,9 @@ _MOST, _LEAST = 4, 0.05  # entries of a sample, and the smallest weight among th
 def fit_weights(records: Records, survey: Survey, tint: F32) -> Records:
     """Interpolate samples whose light is not what interpolation says from records that match it better.
 
-    Each takes the mixture of records near, on any surface that faces alike,
-    that is closest to its own light under the training lights, by least
-    squares with the given weights as a prior. The rays of the survey are the
+    Each takes the mixture of records near, on any surface of the same object
+    that faces alike and of those that it had, that is closest to its own light
+    under the training lights, by least squares with the given weights as a prior. The rays of the survey are the
     same everywhere, so what is noise in one place is noise in the other.
 
     Parameters
@@ -50,6 +50,7 @@ def fit_weights(records: Records, survey: Survey, tint: F32) -> Records:
         (view.height, view.width),
         view.points.position,
         view.points.shading_normal,
+        view.points.instance,
         mesh.extent,
         BUCKET,
         bucket_begin,

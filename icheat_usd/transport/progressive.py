@@ -78,11 +78,9 @@ def build_transports(
     if rays_per_row > MOST_RAYS:
         raise IcheatError(f"{rays_per_row} gather rays a row are more than records can have; take {MOST_RAYS} at most")
     if not view.n:
-        none = np.empty(0, np.int64)
-        rows = SparseRows.empty(0, gather.n)
-        yield _transport(
-            view, none.astype(np.int32), SparseRows.empty(0, 0), [rows] * 3, seed, None, Counts(none, none)
-        )
+        none, nothing = np.empty(0, np.int64), SparseRows.empty(0, gather.n)
+        spread = SparseRows.empty(0, 0)
+        yield _transport(view, none.astype(np.int32), spread, [nothing] * 3, seed, None, Counts(none, none))
         return
     builder = RowBuilder(snapshot, tracer, gather, seed)
     lights = np.ascontiguousarray(training.T)

@@ -9,7 +9,7 @@ import pytest
 from icheat_usd.materials import take_points
 from icheat_usd.progress import silent
 from icheat_usd.samples import ViewSamples, view_samples
-from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.scene import F32, F64, I64, SceneSnapshot
 from icheat_usd.tracing import build_tracer
 from icheat_usd.transport import Transport, build_bounces
 from icheat_usd.transport.allotment import allot_rays
@@ -21,7 +21,7 @@ from icheat_usd.transport.records import Records, RecordSettings, place_records,
 from icheat_usd.transport.sparse import SparseRows
 from icheat_usd.transport.training import training_radiance
 from tests.pipeline import Pipeline
-from tests.scenes import Mesh, box, cornell, look_at, make_snapshot, quad, translation
+from tests.scenes import Material, Mesh, box, cornell, look_at, make_snapshot, quad, translation
 
 
 def floor_scene(width: int = 48, height: int = 36) -> SceneSnapshot:
@@ -208,6 +208,40 @@ def test_no_rows_are_allotted_no_rays() -> None:
     assert counts.diffuse.shape == counts.specular.shape == (0,)
 
 
+def test_little_light_crosses_a_thin_wall_under_a_light_that_was_not_known() -> None:
+    white = Material(diffuse=0.7)
+    around = box((4, 1, 4), (0, 0.5, 0), inward=True)
+    meshes = [
+        Mesh(box((2, 0.02, 4), (-1, -0.01, 0)), white, path="/bright"),
+        Mesh(box((2, 0.02, 4), (1, -0.01, 0)), white, path="/dark"),
+        Mesh(box((0.02, 1, 4), (0, 0.5, 0)), white, path="/wall"),
+        Mesh(np.concatenate([around[:6], around[8:]]), white, path="/around"),
+    ]
+    camera = look_at((0, 5, 0.01), fov=50, width=48, height=48)
+    parts = Pipeline(make_snapshot(meshes, camera=camera), n_gather=512, rays=2048)
+    bounces = build_bounces(parts.snapshot, parts.tracer, parts.gather, rays_per_row=32)
+    training = training_radiance(parts.snapshot, parts.tracer, parts.gather, bounces)
+    settings = RecordSettings(max_share=0.2, coarsest=16)
+    found = list(
+        build_transports(
+            parts.snapshot, parts.tracer, parts.view, parts.gather, training, settings=settings, rays_per_row=1024
+        )
+    )
+    cells, points = parts.gather.points, parts.view.points
+    light = (cells.position + 0.03 * cells.normal)[:, :1] < 0  # all surfaces of one room shine
+    exact = parts.transport.to_view(np.repeat(light, 3, axis=1).astype(np.float32))[:, 0]
+    x = (points.position + 0.03 * points.normal)[:, 0]
+    beside = (x > 0) & (x < 0.3) & (points.normal[:, 1] > 0.9) & (points.position[:, 1] < 0.5)
+    bright = exact[(x < 0) & (x > -0.3)].mean()
+    assert beside.sum() > 100 and exact[beside].max() < 0.1 * bright
+
+    def leaked(transport: Transport) -> F64:
+        wrong: F64 = transport.to_view(np.repeat(light, 3, axis=1).astype(np.float32))[beside, 0] - exact[beside]
+        return np.abs(wrong) / bright
+
+    assert np.sqrt(np.mean(leaked(found[-1]) ** 2)) < 0.02 and leaked(found[-1]).max() < 0.15
+
+
 def test_placement_has_the_same_bits_for_any_number_of_threads() -> None:
     scene = floor_scene()
     view = view_of(scene)
@@ -249,6 +283,25 @@ def test_fitted_weights_find_the_records_that_see_the_same() -> None:
     np.testing.assert_array_equal(own, np.arange(len(found.view)))
     row = np.repeat(np.arange(view.n), np.diff(spread.indptr))
     assert np.all((np.diff(spread.indices) > 0) | (np.diff(row) > 0))
+
+
+def test_fitted_weights_take_no_light_from_another_object() -> None:
+    # A shelf beside a floor in the image: the lights known make patterns that both share, another meets the shelf alone.
+    shelf = Mesh(quad(4), transforms=[translation(2, 0.15, 0)], path="/shelf")
+    scene = make_snapshot([Mesh(quad(8), path="/floor"), shelf], camera=look_at((0, 5, 0.01), width=64, height=64))
+    view = view_of(scene)
+    stripe = view.pixel % view.width // 3 % 2
+    lights = [1 + 0.8 * np.cos(k + 3 * stripe + view.points.position[:, 2]) for k in range(6)]
+    light = np.stack(lights, axis=1).astype(np.float32)
+    records = place(scene, light, view, coarsest=4, tolerance=1.0, max_share=0.3)[0]
+    survey = Survey(np.stack([light, light], axis=1), np.empty(0, np.int64), np.empty((0, 2, 6), np.float32))
+    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    found = fit_weights(records, survey, tint)
+    on_shelf = (view.points.instance == 1).astype(np.float32)[:, None]
+    leaked = found.interpolation.matmul(on_shelf[found.view])[:, 0] - on_shelf[:, 0]
+    assert 0.2 < on_shelf.mean() < 0.8
+    assert (np.diff(found.interpolation.indptr) != np.diff(records.interpolation.indptr)).mean() > 0.05
+    assert np.abs(leaked).max() < 1e-5
 
 
 def test_a_thin_bright_bar_gets_records_of_its_own() -> None:
