@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -70,9 +70,9 @@ def changed_light(
     to_world: ArrayLike | None,
     radiance: float | Sequence[float] | None,
     size: Sequence[float] | None,
-    texture: Image | None,
+    image: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What `LiveSession.set_light` says, as fields of a `LightChange`."""
+    """What `LiveSession.set_light` says, as fields of a `LightChange`; `image` is one of `read_image`."""
     values: dict[str, Any] = {}
     if gain is not None:
         values["gain"] = colour(gain, f"{path}: gain")
@@ -82,9 +82,7 @@ def changed_light(
         values["size"] = _size(path, size)
     if to_world is not None or move is not None or turn is not None:
         values["to_world"] = _placed(path, now.to_world if to_world is None else to_world, move, turn)
-    if texture is not None:
-        values |= _image(texture)
-    return values
+    return values | dict(image)
 
 
 def new_light(
@@ -94,9 +92,9 @@ def new_light(
     at: Sequence[float],
     radiance: float | Sequence[float],
     size: Sequence[float],
-    texture: Image | None,
+    image: Mapping[str, Any],
 ) -> LightChange:
-    """What `LiveSession.add_light` says."""
+    """What `LiveSession.add_light` says; `image` is one of `read_image`."""
     if not path.startswith("/"):
         raise EditError(f"'{path}' is no path for a light, such as /World/Lights/Key")
     try:
@@ -104,13 +102,13 @@ def new_light(
     except (KeyError, ValueError):
         names = ", ".join(kind.name.lower() for kind in LightKind)
         raise EditError(f"'{kind}' is no kind of light; known are {names}") from None
-    change = LightChange(
+    return LightChange(
         to_world=_placed(path, np.eye(3, 4) if to_world is None else to_world, at if to_world is None else None, None),
         radiance=colour(radiance, f"{path}: radiance"),
         size=_size(path, size),
         added=known,
+        **image,
     )
-    return change if texture is None else replace(change, **_image(texture))
 
 
 def _filled(change: LightChange, own: LightChange) -> LightChange:
@@ -155,7 +153,10 @@ def _rotation(path: str, turn: tuple[Sequence[float], float]) -> F64:
     return turned
 
 
-def _image(texture: str | Path | F32) -> dict[str, Any]:
+def read_image(texture: Image | None) -> dict[str, Any]:
+    """What commands take as an image, as fields of a `LightChange`; "" takes the image away, None is none of them."""
+    if texture is None:
+        return {}
     if isinstance(texture, np.ndarray):
         return {"texture": np.ascontiguousarray(texture, np.float32), "texture_file": ""}
     if not str(texture):

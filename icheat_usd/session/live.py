@@ -37,7 +37,7 @@ from icheat_usd.scene import F32, F64, LightKind, SceneSnapshot
 from icheat_usd.session import films
 from icheat_usd.session.dabs import dabbed, filled_mask
 from icheat_usd.session.document import Session
-from icheat_usd.session.light_changes import all_lights, changed_light, new_light
+from icheat_usd.session.light_changes import all_lights, changed_light, new_light, read_image
 from icheat_usd.session.live_authoring import LiveAuthoring
 from icheat_usd.session.live_events import Level, Listener
 from icheat_usd.session.live_frames import LiveFrames
@@ -219,9 +219,11 @@ class LiveSession(LiveAuthoring):
         EditError, LightError, ImageError
             There is no such light, or a value does not fit it.
         """
-        path = self._light(light)
-        change = changed_light(path, self.lights[path], gain, move, turn, to_world, radiance, size, texture)
-        self._do(f"light {path}", self.state.with_light(path, **change))
+        image = read_image(texture)
+        with self._changing() as state:
+            path = self._light(light)
+            change = changed_light(path, self.lights[path], gain, move, turn, to_world, radiance, size, image)
+            self._do(f"light {path}", state.with_light(path, **change))
 
     def add_light(
         self,
@@ -235,43 +237,49 @@ class LiveSession(LiveAuthoring):
         texture: str | Path | F32 | None = None,
     ) -> None:
         """Add a light, at a place in metres and stage axes or with a whole transform; see `set_light`."""
-        if path in self.lights:
-            raise EditError(f"{path} is a light already; choose another path")
-        change = new_light(path, kind, to_world, at, radiance, size, texture)
-        self._do(f"add light {path}", self.state.with_light(path, **vars(change)))
+        change = new_light(path, kind, to_world, at, radiance, size, read_image(texture))
+        with self._changing() as state:
+            if path in self.lights:
+                raise EditError(f"{path} is a light already; choose another path")
+            self._do(f"add light {path}", state.with_light(path, **vars(change)))
 
     def remove_light(self, light: str) -> None:
         """Take a light away."""
-        path = self._light(light)
-        added = path in self.state.lights and self.state.lights[path].added is not None
-        state = self.state.without_light(path) if added else self.state.with_light(path, removed=True)
-        self._do(f"remove light {path}", state)
+        with self._changing() as state:
+            path = self._light(light)
+            added = path in state.lights and state.lights[path].added is not None
+            without = state.without_light(path) if added else state.with_light(path, removed=True)
+            self._do(f"remove light {path}", without)
 
     # Edits ------------------------------------------------------------------------------------------------------------
 
     def set_amount(self, edit: str, amount: float) -> None:
         """How much of an edit is laid over the weaker ones, by its name or path; 0 leaves it out."""
-        path = self._edit(edit)
-        amount = number(amount, f"{path}: the amount")
-        self._do(f"amount {path}", self.state.with_edit(path, amount=amount))
+        with self._changing() as state:
+            path = self._edit(edit)
+            amount = number(amount, f"{path}: the amount")
+            self._do(f"amount {path}", state.with_edit(path, amount=amount))
 
     def set_parameters(self, edit: str, **values: Value) -> None:
         """Parameters of an edit's operation, at all its keys."""
-        path = self._edit(edit)
-        self._do(f"parameters {path}", self.state.with_parameters(path, plain_values(values)))
+        with self._changing() as state:
+            path = self._edit(edit)
+            self._do(f"parameters {path}", state.with_parameters(path, plain_values(values)))
 
     def mute(self, edit: str, muted: bool = True) -> None:
         """Mute an edit, or let it take part again."""
-        path = self._edit(edit)
-        self._do(f"{'mute' if muted else 'unmute'} {path}", self.state.with_edit(path, enabled=not muted))
+        with self._changing() as state:
+            path = self._edit(edit)
+            self._do(f"{'mute' if muted else 'unmute'} {path}", state.with_edit(path, enabled=not muted))
 
     def move_edit(self, edit: str, *, before: str | None = None, after: str | None = None) -> None:
         """Move an edit before or after another one; to the end, the strongest place, if neither is given."""
-        path = self._edit(edit)
-        others = {"before": before, "after": after}
-        named = {name: self._edit(other) for name, other in others.items() if other is not None}
-        order = moved([edit.path for edit in self.stack.edits], path, **named)
-        self._do(f"move {path}", replace(self.state, order=order))
+        with self._changing() as state:
+            path = self._edit(edit)
+            others = {"before": before, "after": after}
+            named = {name: self._edit(other) for name, other in others.items() if other is not None}
+            order = moved([edit.path for edit in self.stack.edits], path, **named)
+            self._do(f"move {path}", replace(state, order=order))
 
     def dab(
         self, edit: str, at: Sequence[float], radius: float, *, side: str = "receivers", strength: float = 1.0
@@ -286,24 +294,26 @@ class LiveSession(LiveAuthoring):
             A side without a mask has full weight everywhere: `fill_mask` it with 0 first to paint where it acts.
         strength : in [-1, 1]
         """
-        path, frame = self._edit(edit), self._frames.here()
-        selected, mask = self._side(path, side)
-        centre = (numbers(at, 3, "the place of a dab") - frame.snapshot.centre).astype(np.float32)
-        painted = dabbed(
-            frame.places,
-            selected,
-            mask,
-            centre,
-            number(radius, "the radius of a dab"),
-            number(strength, "the strength of a dab"),
-        )
-        self._do(f"dab {path}", self.state.with_edit(path, **{_MASKS[side]: painted}))
+        with self._changing() as state:
+            path, frame = self._edit(edit), self._frames.here()
+            selected, mask = self._side(path, side)
+            centre = (numbers(at, 3, "the place of a dab") - frame.snapshot.centre).astype(np.float32)
+            painted = dabbed(
+                frame.places,
+                selected,
+                mask,
+                centre,
+                number(radius, "the radius of a dab"),
+                number(strength, "the strength of a dab"),
+            )
+            self._do(f"dab {path}", state.with_edit(path, **{_MASKS[side]: painted}))
 
     def fill_mask(self, edit: str, weight: float, *, side: str = "receivers") -> None:
         """Give all surfaces that a side of an edit selects one weight."""
-        path, frame = self._edit(edit), self._frames.here()
-        mask = filled_mask(frame.places, self._side(path, side)[0], weight)
-        self._do(f"fill mask {path}", self.state.with_edit(path, **{_MASKS[side]: mask}))
+        with self._changing() as state:
+            path, frame = self._edit(edit), self._frames.here()
+            mask = filled_mask(frame.places, self._side(path, side)[0], weight)
+            self._do(f"fill mask {path}", state.with_edit(path, **{_MASKS[side]: mask}))
 
     def _side(self, path: str, side: str) -> tuple[frozenset[str], SurfaceMask | None]:
         """What one side of an edit selects, and its mask as it is now."""
@@ -413,6 +423,12 @@ class LiveSession(LiveAuthoring):
             return {"total": resident.bytes(), "limit": resident.limit, "frame": whole, "own": own}
 
     # Inside -----------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _changing(self) -> Iterator[LiveState]:
+        """A command that goes on from the state: no other one comes in between."""
+        with self._frames.looking():
+            yield self._frames.state
 
     def _do(self, label: str, state: LiveState) -> None:
         with self._frames.command():

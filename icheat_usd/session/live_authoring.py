@@ -60,15 +60,15 @@ class LiveAuthoring:
         EditError, SidecarError
             Something cannot be written; the layer is then as before.
         """
-        changes = self._frames.state
-        if not (changes.edits or changes.order):
-            return ()
-        session, stack = self.session, self.stack
+        with self._frames.looking():
+            session, stack, changes = self.session, self.stack, self._frames.state
+            if not (changes.edits or changes.order):
+                return ()
 
-        def write() -> tuple[Finding, ...]:
-            return write_changes(session, changes, stack, layer=layer, frame=frame, sidecar=sidecar, why=why)
+            def write() -> tuple[Finding, ...]:
+                return write_changes(session, changes, stack, layer=layer, frame=frame, sidecar=sidecar, why=why)
 
-        return self._author("commit", layer, write, replace(changes, edits=UNCHANGED.edits, order=()))
+            return self._author("commit", layer, write, replace(changes, edits=UNCHANGED.edits, order=()))
 
     def commit_lights(self, layer: str, *, frame: float | None = None, why: str = "") -> tuple[Finding, ...]:
         """Write what was changed about lights to a layer and save it, as one step that can be undone.
@@ -92,16 +92,16 @@ class LiveAuthoring:
         EditError
             Something cannot be written, such as a light inside an instance; the layer is then as before.
         """
-        changes, session = self._frames.state, self.session
-        if not changes.lights:
-            return ()
-        snapshot = self._frames.here().snapshot
+        with self._frames.looking() as shown:
+            session, snapshot, changes = self.session, shown.snapshot, self._frames.state
+            if not changes.lights:
+                return ()
 
-        def write() -> tuple[Finding, ...]:
-            return write_lights(session.stage, snapshot, changes, layer=layer, frame=frame, why=why)
+            def write() -> tuple[Finding, ...]:
+                return write_lights(session.stage, snapshot, changes, layer=layer, frame=frame, why=why)
 
-        after = replace(changes, lights=UNCHANGED.lights)
-        return self._author("commit lights", layer, write, after, is_about_lights=True)
+            after = replace(changes, lights=UNCHANGED.lights)
+            return self._author("commit lights", layer, write, after, is_about_lights=True)
 
     def add_edit(self, name: str, *, layer: str = "session", **values: Any) -> str:
         """Add an edit to the stack, in the stage's session layer unless said otherwise; see `Session.add_edit`."""

@@ -12,7 +12,7 @@ from icheat_usd.errors import EditError
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.session import Quality, Session
 from icheat_usd.session.commit_lights import write_lights
-from icheat_usd.session.light_changes import all_lights, changed_light, new_light
+from icheat_usd.session.light_changes import all_lights, changed_light, new_light, read_image
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_state import UNCHANGED, LiveState
 from tests.session.test_session import ROOM
@@ -98,7 +98,7 @@ def Xform "World"
 def changed(snapshot: SceneSnapshot, state: LiveState, name: str, **values: object) -> LiveState:
     """What `LiveSession.set_light` does to a state."""
     path = next(path for path in snapshot.light_paths if path.endswith(f"/{name}"))
-    given = dict.fromkeys(("gain", "move", "turn", "to_world", "radiance", "size", "texture")) | values
+    given = dict.fromkeys(("gain", "move", "turn", "to_world", "radiance", "size")) | {"image": {}} | values
     now = all_lights(snapshot, state)[path]
     return state.with_light(path, **changed_light(path, now, **given))
 
@@ -127,7 +127,7 @@ def test_every_kind_of_change_of_every_kind_of_light_is_read_back(tmp_path: Path
     state = changed(snapshot, state, "Disk", gain=0.0)
     state = changed(snapshot, state, "Sun", size=(0.05,), turn=((1, 0, 0), 10))
     state = changed(snapshot, state, "Sky", turn=((0, 0, 1), 50), gain=2.0)
-    added = new_light("/World/New/Key", "rect", None, (0.5, 0.1, 0.2), (1, 2, 3), (0.3, 0.2), None)
+    added = new_light("/World/New/Key", "rect", None, (0.5, 0.1, 0.2), (1, 2, 3), (0.3, 0.2), {})
     state = state.with_light("/World/New/Key", **vars(added))
     wanted = shown(snapshot, state)
     assert write_lights(session.stage, snapshot, state, layer="shot.usda", frame=None, why="test") == ()
@@ -208,8 +208,8 @@ def test_what_cannot_be_written_is_one_sentence_and_leaves_the_layer(tmp_path: P
     refused(changed(snapshot, UNCHANGED, "Pulses", gain=2.0), "intensity changes over time; give the frame")
     refused(UNCHANGED.with_light("/World/Lamp", removed=True), "/World/Lamp/Below lies below it")
     image = np.ones((2, 4, 3), np.float32)
-    refused(changed(snapshot, UNCHANGED, "Lamp", texture=image), "its image is in memory alone")
-    taken = new_light("/World/Block", "rect", None, (0, 0, 0), 1.0, (1, 1), None)
+    refused(changed(snapshot, UNCHANGED, "Lamp", image=read_image(image)), "its image is in memory alone")
+    taken = new_light("/World/Block", "rect", None, (0, 0, 0), 1.0, (1, 1), {})
     refused(UNCHANGED.with_light("/World/Block", **vars(taken)), "/World/Block exists already as a Cube")
     # The first light is written, the second refused: neither stays.
     both = changed(snapshot, changed(snapshot, UNCHANGED, "Lamp", gain=2.0), "Bulb", gain=2.0)

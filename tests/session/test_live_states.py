@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -108,6 +109,31 @@ def test_a_gesture_joins_its_own_steps_alone(stage: Path) -> None:
             raise RuntimeError
         assert live.undo() == "broken off"
         assert live.stack.edits[0].amount == pytest.approx(0.1)
+
+
+def test_commands_of_two_threads_lose_nothing_of_each_other(stage: Path, tmp_path: Path) -> None:
+    shutil.copytree(stage.parent, tmp_path, dirs_exist_ok=True)
+    with open_live(tmp_path / stage.name) as live:
+        live.wait("rest")
+        light = next(iter(live.lights))
+
+        def meanwhile(act: Callable[[], object], other: Callable[[], object]) -> None:
+            """`act` in another thread, which has to wait until `other` is done."""
+            with live._frames.command():
+                thread = threading.Thread(target=act, daemon=True)
+                thread.start()
+                time.sleep(0.2)
+                other()
+            thread.join(60)
+            assert not thread.is_alive()
+
+        meanwhile(lambda: live.set_light(light, gain=0.5), lambda: live.set_amount("warm", 0.5))
+        assert live.state.lights[light].gain == (0.5, 0.5, 0.5)
+        assert live.state.edits["/World/Edits/warm"].amount == 0.5
+        meanwhile(lambda: live.commit("session"), lambda: live.set_light(light, gain=0.25))
+        assert live.state.lights[light].gain == (0.25, 0.25, 0.25) and not live.state.edits
+        meanwhile(lambda: live.commit_lights("session"), lambda: live.set_amount("warm", 0.75))
+        assert live.state.edits["/World/Edits/warm"].amount == 0.75 and not live.state.lights
 
 
 def test_mistakes_are_one_clear_error(stage: Path) -> None:
