@@ -70,10 +70,14 @@ def _piece_products(now, before, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _take_proportional(now, before, factor, rest):  # type: ignore[no-untyped-def]
+def _take_proportional(now, before, factor, rest, size):  # type: ignore[no-untyped-def]
+    left, whole = np.float32(0), np.float32(0)
     for k in range(len(now)):
         for c in range(3):
-            rest[k, c] = now[k, c] - factor[c] * before[k, c]
+            value = now[k, c] - factor[c] * before[k, c]
+            rest[k, c] = value
+            left, whole = max(left, abs(value)), max(whole, abs(now[k, c]))
+    size[0], size[1] = left, whole
 
 
 @parallel_kernel
@@ -84,13 +88,13 @@ def _find_products(pieces, now, before, sums):  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def _find_rest(pieces, now, before, factors, rest):  # type: ignore[no-untyped-def]
+def _find_rest(pieces, now, before, factors, rest, sizes):  # type: ignore[no-untyped-def]
     for p in prange(len(pieces)):
         some = slice(pieces[p, 1], pieces[p, 2])
-        _take_proportional(now[some], before[some], factors[pieces[p, 0]], rest[some])
+        _take_proportional(now[some], before[some], factors[pieces[p, 0]], rest[some], sizes[p])
 
 
-def proportions(pieces, now, before, factors, rest):  # type: ignore[no-untyped-def]
+def proportions(pieces, now, before, factors, rest, size):  # type: ignore[no-untyped-def]
     """The factors, channel by channel, that bring earlier values nearest to what they are now, and what is left.
 
     Parameters
@@ -102,32 +106,20 @@ def proportions(pieces, now, before, factors, rest):  # type: ignore[no-untyped-
         Receives a colour and pad, 16 times, of those that have pieces.
     rest : (n_cells, 3) float32
         Receives ``now - factor * before``.
+    size : (n_functions, 2) float32
+        Receives the largest size of that and of `now`, of those that have pieces.
     """
     sums = np.empty((len(pieces), 6))
     _find_products(pieces, now, before, sums)
     total = np.zeros((len(factors), 6))
     np.add.at(total, pieces[:, 0], sums)
-    both, size = total[:, :3], total[:, 3:]
-    found = np.divide(both, size, out=np.zeros_like(both), where=size > 0)
+    both, squared = total[:, :3], total[:, 3:]
+    found = np.divide(both, squared, out=np.zeros_like(both), where=squared > 0)
     some = np.unique(pieces[:, 0])
     factors[some] = np.tile(np.pad(found[some], ((0, 0), (0, 1))), (1, 16))
-    _find_rest(pieces, now, before, factors, rest)
-
-
-@kernel
-def _squares_run(first, end, versions, sizes, out):  # type: ignore[no-untyped-def]
-    out[first:end] = np.float32(0)
-    for v in versions:
-        for k in range(first, end):
-            out[k] += sizes[v, k] * sizes[v, k]
-
-
-@parallel_kernel
-def sum_squares(versions, sizes, out):  # type: ignore[no-untyped-def]
-    """Sums over some versions of squared sizes (n_versions, n), to `out` (n,)."""
-    n = len(out)
-    for job in prange((n + 2047) // 2048):
-        _squares_run(2048 * job, min(n, 2048 * job + 2048), versions, sizes, out)
+    sizes = np.empty((len(pieces), 2), np.float32)
+    _find_rest(pieces, now, before, factors, rest, sizes)
+    np.maximum.at(size, pieces[:, 0], sizes)
 
 
 @kernel

@@ -34,11 +34,6 @@ class Narrow:
         self._n_versions = -1  # that the products are narrow for
         self._is_asked = False  # whether versions had a chance to tell what they need
 
-    @property
-    def is_ready(self) -> bool:
-        """Whether the products of all lights are known and rows are narrowed for them."""
-        return self._products.is_narrow and self._is_same is not None and bool(self._is_same.all())
-
     def forget(self) -> None:
         """Lights may be others now."""
         self._is_same, self._learnt = None, None
@@ -85,6 +80,7 @@ class Narrow:
         if is_same.all() and len(is_same):
             out[:, : self._exact.n_tiles] = 0
             add(out)
+            self._products.see(out)
         else:
             self._products.multiply_all(rest, out, known=add)
 
@@ -95,7 +91,7 @@ class Narrow:
         begin = np.arange(0, len(radiance), _PIECE)
         pieces: I64 = np.stack([0 * begin, begin, np.minimum(begin + _PIECE, len(radiance))], axis=1)
         share, rest = np.zeros((1, 4 * 16), np.float32), np.empty_like(radiance)
-        proportions(pieces, radiance, self._radiance[light], share, rest)
+        proportions(pieces, radiance, self._radiance[light], share, rest, np.zeros((1, 2), np.float32))
         factors[light] *= share[0]
         return rest
 

@@ -11,7 +11,7 @@ import numpy as np
 from icheat_usd.kernels import versions as kernels
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
-from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles, sum_squares
+from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
 from icheat_usd.scene import F32, F64, I32, I64, U8
@@ -25,10 +25,12 @@ SMALL_BYTES = 8_000_000
 #: What is left out is expected to be off by as much of the image if its terms have random signs. They do not quite:
 #: measured with training lights, it adds up to one to four times as much.
 LEFT_OUT = 0.003
+#: The same for each version alone, however many there are: most of them act on pixels of their own.
+LEFT_OUT_OF_VERSION = 0.0015
 #: More than this is not read for light not seen before, whatever is left out.
 MOVING_BYTES = 80_000_000
-#: A frame that turns out darker than this share of the last one is multiplied again, to the error that it allows.
-_DARKER = 0.5
+#: What is read first of light not seen before, to find how bright the image will be.
+_FIRST_BYTES = 4_000_000
 #: Entries of uncompressed rows that are multiplied in one step of a refinement: some hundredths of a second.
 _ENTRIES_AT_ONCE = 5_000_000
 #: Versions that are transformed at once.
@@ -207,8 +209,8 @@ class Products:
     def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:
         """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows.
 
-        Of a large transport, only the terms are read that are large in these versions together, seen beside the
-        unedited light; see `LEFT_OUT`.
+        Of a large transport, only the terms are read that are large in a version, seen beside the unedited light;
+        see `LEFT_OUT_OF_VERSION`. Each version is seen alone, so that it does not matter which change together.
         """
         if not len(pairs):
             return
@@ -222,15 +224,17 @@ class Products:
             return
         least = np.full(len(self._versions), np.finfo(np.float32).tiny, np.float32)
         if self._large_terms is not None and not narrow:
-            least[:] = max(self._least_of(np.unique(version)), least[0])
+            for v in np.unique(version):
+                least[v] = max(self._least_of(int(v)), least[v])
         tiles.multiply(self._versions, self._sizes, least, tile, version, pairs, out)
 
-    def _least_of(self, versions: I64) -> float:
-        """Least terms of some versions that count."""
+    def _least_of(self, version: int) -> float:
+        """Least terms of a version that count; 0 where it has few."""
         assert self._large_terms is not None
-        squares = np.empty(self._n_leaves, np.float32)
-        sum_squares(versions, self._sizes, squares)
-        return self._large_terms.least_of_error(np.sqrt(squares), LEFT_OUT**2 * self._shown, MOVING_BYTES)
+        size = self._sizes[version]
+        if np.count_nonzero(size) < _MANY_CELLS:
+            return 0.0
+        return self._large_terms.least_of_error(size, LEFT_OUT_OF_VERSION**2 * self._shown, MOVING_BYTES)
 
     def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
         """Products of some tiles of uncompressed rows with values (n, 3) that are 0 but at some cells."""
@@ -294,16 +298,24 @@ class Products:
         size = np.empty((1, self._n_leaves), np.float32)
         largest_channels(np.zeros(1, np.int64), values, size)
         size[0, 0] = np.inf  # means stay, however dark it is
-        before = self._shown
-        for _ in range(2):
-            least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
-            leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
-            tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out)
-            if known is not None:
-                known(out)
-            self.see(out)
-            if self._shown >= _DARKER**2 * before:
-                break
+        # How bright the image is follows from the largest terms, not from the last frame: same light, same bits.
+        first = self._large_terms.least(size[0], _FIRST_BYTES)
+        self._multiply_large(values, size, first, out, known)
+        self.see(out)
+        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
+        if least < first:
+            self._multiply_large(values, size, least, out, known)
+
+    def _multiply_large(
+        self, values: F32, size: F32, least: float, out: F32, known: Callable[[F32], None] | None
+    ) -> None:
+        """Products of all tiles with the terms of `least` and more, and what is known."""
+        assert self._tiles is not None
+        tile = np.arange(self.n_tiles, dtype=np.int32)
+        leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
+        self._tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out)
+        if known is not None:
+            known(out)
 
     def see(self, products: F32) -> None:
         """Take products of all tiles for those of the unedited light, beside which others are large or small."""

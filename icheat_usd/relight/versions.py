@@ -25,6 +25,8 @@ from icheat_usd.transport.packed import LANES
 
 #: Pairs of tile and version that are refined at once.
 _PAIRS_AT_ONCE = 256
+#: Of a difference, what is taken for rounding: it has no products of its own.
+_ROUNDED = 1e-6
 #: Casters of a version that are evaluated in one piece.
 _PIECE = 2048
 
@@ -133,10 +135,10 @@ class Versions:
         kept = np.array(sorted(needed), np.int64)
         number = {int(v): k for k, v in enumerate(kept)}
         parts = [self._lists.part(int(v)) for v in kept]
-        is_learnt = len(self._reference) == len(self._deltas)
+        self._pad_reference()
         deltas, references = (
             np.concatenate([np.zeros((0, 3), np.float32), *(values[part] for part in parts)])
-            for values in (self._deltas, self._reference if is_learnt else np.zeros_like(self._deltas))
+            for values in (self._deltas, self._reference)
         )
         versions = [version for v in kept if (version := self._versions[v]) is not None]
         assert len(versions) == len(kept)
@@ -238,13 +240,17 @@ class Versions:
         plain = np.array([v for v in stale if not self._is_by_pairs(v)], np.int64)
         known = np.array([v in self._known for v in plain], np.bool_)
         factors = np.zeros((self.n if known.any() else 0, LANES), np.float32)
-        rest = self._deltas
+        rest, differs = self._deltas, ~known
         if known.any():
-            rest = rest.copy()
-            proportions(pieces[np.isin(pieces[:, 0], plain[known])], self._deltas, self._reference, factors, rest)
-        self._products.prepare(plain, tables, rest)
+            rest, size = np.empty_like(rest), np.zeros((self.n, 2), np.float32)
+            if not known.all():
+                rest[:] = self._deltas
+            some = pieces[np.isin(pieces[:, 0], plain[known])]
+            proportions(some, self._deltas, self._reference, factors, rest, size)
+            differs |= size[plain, 0] > _ROUNDED * size[plain, 1]
+        self._products.prepare(plain[differs], tables, rest)
         self._multiply(self._pairs_of_some(plain[~known]))
-        self._multiply_rest(plain[known], factors)
+        self._multiply_rest(plain[known & differs], plain[known], factors)
         for v in stale:
             if self._is_by_pairs(v):
                 self._multiply_by_pairs(int(v))
@@ -267,12 +273,17 @@ class Versions:
         version = self._versions[v]
         return frozenset() if version is None else version.rows
 
-    def _multiply_rest(self, versions: I64, factors: F32) -> None:
-        """What is not like an earlier difference, and to that the exact products of the earlier one times factors."""
+    def _multiply_rest(self, differ: I64, versions: I64, factors: F32) -> None:
+        """What is not like an earlier difference, and to that the exact products of the earlier one times factors.
+
+        Only those that `differ` by more than rounding have something to be multiplied.
+        """
         if not len(versions):
             return
         pairs = self._pairs_of_some(versions)
-        self._multiply(pairs, narrow=self._products.is_narrow)
+        if len(differ) < len(versions):
+            self.values[:, pairs] = 0
+        self._multiply(self._pairs_of_some(differ), narrow=self._products.is_narrow)
         known, values = (array.reshape(*array.shape[:2], 4 * LANES) for array in (self._known_values, self.values))
         add_version_residuals(pairs, self._pairs.version, known, factors, values)
 
@@ -308,14 +319,18 @@ class Versions:
     def _learn(self, v: int, exact: F32) -> None:
         """Keep a version's exact products, and what they are the products of."""
         self._known_values = self._pairs.grown(self._known_values)
-        if len(self._reference) != len(self._deltas):
-            reference = np.zeros_like(self._deltas)
-            reference[: len(self._reference)] = self._reference
-            self._reference = reference
+        self._pad_reference()
         pairs, some = self._pairs.of_version[v], self._lists.part(v)
         self._known_values[:, pairs] = exact
         self._reference[some] = self._deltas[some]
         self._known.add(v)
+
+    def _pad_reference(self) -> None:
+        """Versions that were added since are not known."""
+        if len(self._reference) != len(self._deltas):
+            reference = np.zeros_like(self._deltas)
+            reference[: len(self._reference)] = self._reference
+            self._reference = reference
 
     def _multiply_by_pairs(self, v: int) -> None:
         assert self._pair_products is not None and self._light is not None

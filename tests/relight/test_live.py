@@ -480,8 +480,9 @@ def test_a_large_transport_is_read_in_part_while_lights_move(monkeypatch):
     gains = np.ones((2, 3), np.float32)
     whole = fresh_packed(of, rows, stack, gains).relit()
     monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
+    monkeypatch.setattr("icheat_usd.relight.products._FIRST_BYTES", rows.n_bytes // 50)
     errors = []
-    for left_out, limit in ((0.01, 10**9), (0.05, 10**9), (0.0, rows.n_bytes // 8)):
+    for left_out, limit in ((0.02, 10**9), (0.1, 10**9), (0.0, rows.n_bytes // 8)):
         monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", left_out)
         monkeypatch.setattr("icheat_usd.relight.products.MOVING_BYTES", limit)
         shown = fresh_packed(of, rows, stack, gains)
@@ -491,9 +492,9 @@ def test_a_large_transport_is_read_in_part_while_lights_move(monkeypatch):
         seen = shown.relit()
         errors.append([rms_of(2 * getattr(seen, layer), getattr(whole, layer)) for layer in LAYERS])
     small, large, limited = np.array(errors)
-    assert (small < 5 * 0.01).all()
+    assert (small < 5 * 0.02).all()
     assert (large > 3 * small).all()
-    assert (large < 5 * 0.05).all()
+    assert (large < 5 * 0.1).all()
     assert (limited > large).all()
 
 
@@ -501,6 +502,7 @@ def test_a_light_that_goes_down_at_once_has_the_terms_that_are_large_in_what_is_
     """The limit of what is left out is that of the image as it is, not as it was one frame ago."""
     of, rows = pipeline("full"), poor(packed("full"))
     monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
+    monkeypatch.setattr("icheat_usd.relight.products._FIRST_BYTES", rows.n_bytes // 50)
     monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", 0.01)
     shown = fresh_packed(of, rows, EditStack("/none", ()), np.ones((2, 3), np.float32))
     shown.frame()
@@ -625,3 +627,62 @@ def test_a_stack_that_cannot_be_shown_changes_nothing():
     with pytest.raises(EditError, match="/c: the edit looks at receivers, which needs exact rows"):
         shown.set_stack(EditStack("/stack", (edit("c", "falloff"),)))
     np.testing.assert_array_equal(shown.frame(), before)
+
+
+@pytest.mark.parametrize("collects", [False, True])
+def test_what_is_known_of_versions_outlives_those_that_are_collected(collects, monkeypatch):
+    """At rest a gain is exact for the edits that were there, whether or not others have come and gone since."""
+    of, rows = pipeline("full"), poor(packed("full"))
+    monkeypatch.setattr("icheat_usd.relight.narrow.NARROW_BYTES", rows.n_bytes // 8)
+    if collects:
+        monkeypatch.setattr("icheat_usd.relight.live.SPARE_VERSIONS", 0)
+        monkeypatch.setattr("icheat_usd.relight.live.SPARE_GROUPS", -(10**6))
+    shown = fresh_packed(of, rows, EditStack("/none", ()), np.ones((2, 3), np.float32))
+    first = edit("a", "scale", select("/floor", "/back"), select("/red", "/green", "/ceiling"))
+    shown.set_stack(EditStack("/stack", (first,)))
+    refined(shown)
+    both = EditStack("/stack", (first, edit("b", "scale", select("/tall"), select("/back"))))
+    shown.set_stack(both)
+    shown.frame()
+    for light in (0, 1):
+        shown.lights.set_gain(light, (0.4, 0.4, 0.4))
+    found, exact = shown.relit(), fresh(of, both, shown.lights.gains).relit()
+    mine = exact.indirect_edited - exact.indirect
+    alone = fresh(of, EditStack("/stack", (first,)), shown.lights.gains).relit()
+    of_first = ((alone.indirect_edited != alone.indirect) & (alone.indirect_edited == exact.indirect_edited)).all(
+        axis=1
+    )
+    assert of_first.any()
+    wrong = (found.indirect_edited - found.indirect - mine)[of_first]
+    assert np.abs(wrong).max() < 1e-4 * np.abs(mine).max()
+
+
+def test_products_do_not_depend_on_what_was_shown_before(monkeypatch):
+    """Before the first rest, too: brightness is that of this light, and each edit is seen alone."""
+    of, rows = pipeline("full"), poor(packed("full"))
+    monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
+    monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", 0.05)
+    monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT_OF_VERSION", 0.05)
+    monkeypatch.setattr("icheat_usd.relight.products._MANY_CELLS", 16)
+    monkeypatch.setattr("icheat_usd.relight.products._FIRST_BYTES", rows.n_bytes // 50)
+    stack = EditStack(
+        "/stack",
+        (
+            edit("a", "scale", select("/floor"), select("/red", "/green")),
+            edit("b", "scale", select("/tall"), select("/back", "/floor")),
+        ),
+    )
+    gains = np.array([[0.01, 0.02, 0.01], [0.02, 0.01, 0.03]], np.float32)
+    expected = fresh_packed(of, rows, stack, gains).frame()
+    shown = fresh_packed(of, rows, stack, np.ones((2, 3), np.float32))
+    shown.frame()
+    for path in ("/a", "/b"):
+        shown.set_amount(path, 0.3)
+        shown.frame()
+    for light in (0, 1):
+        shown.lights.set_gain(light, gains[light])
+        shown.frame()
+    for path in ("/b", "/a"):
+        shown.set_amount(path, 1.0)
+        shown.frame()
+    np.testing.assert_array_equal(shown.frame(), expected)
