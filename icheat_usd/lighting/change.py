@@ -75,8 +75,8 @@ def no_lights() -> Lights:
 class LightImages:
     """Images that lights get one after another, behind those of a scene.
 
-    All texels lie in one array, so that a new image copies no others but when there is no room left. Where an image
-    lies says which it is: no place is used twice.
+    All texels lie in one array, so that a new image copies no others; when there is no room left, the next ones get
+    an array of their own, behind the scene's. Where an image lies does not say which it is.
     """
 
     def __init__(self, textures: Textures) -> None:

@@ -35,6 +35,7 @@ class _Light:
     following: Following | None = None  #: what is kept until it rests
     direct: F32 | None = None  #: at the cells, of which the present radiance came
     moved: int = 0  #: what `LiveLights.moves` was at its last change
+    image: int = 0  #: number of its image, which no other one gets; 0 is that of the scene, or none
 
 
 class LiveLights:
@@ -73,6 +74,7 @@ class LiveLights:
         self._around: Surroundings = build_surroundings(
             snapshot, tracer, view, gather, bounces, n_bounces, seed, sparse
         )
+        self._n_images = 0  # that lights were given
         self._lights = [_Light(one_light(snapshot, light)) for light in range(len(snapshot.lights.kind))]
         n = len(self._lights)
         self.revision = 0  #: grows with everything that changes the light
@@ -87,6 +89,11 @@ class LiveLights:
     def paths(self) -> tuple[str, ...]:
         """Scene path of each light."""
         return tuple(light.alone.light_paths[0] for light in self._lights)
+
+    @property
+    def images(self) -> tuple[int, ...]:
+        """Number of each light's image: other images have other numbers; 0 is that of the scene, or none."""
+        return tuple(light.image for light in self._lights)
 
     def snapshot(self) -> SceneSnapshot:
         """The scene with the lights as they are now; gains are multiplied into their radiance."""
@@ -147,6 +154,7 @@ class LiveLights:
         )
         if texture is not None:
             state.bins = None
+            state.image = self._number(texture)
         self._show(light)
 
     def add(
@@ -163,7 +171,7 @@ class LiveLights:
         alone = new_light(
             self._scene, self._images, path, kind, to_world=to_world, radiance=radiance, size=size, texture=texture
         )
-        self._lights.append(_Light(alone))
+        self._lights.append(_Light(alone, image=self._number(texture)))
         self.gains = np.concatenate([self.gains, np.ones((1, 3), np.float32)])
         self.radiance = np.concatenate([self.radiance, np.zeros((1, *self.radiance.shape[1:]), np.float32)])
         self.view_direct = np.concatenate([self.view_direct, np.zeros((1, *self.view_direct.shape[1:]), np.float32)])
@@ -196,6 +204,12 @@ class LiveLights:
     def cell_light(self) -> CellLight:
         """What `Relighter` takes, from the present state; its `direct` is not kept and empty."""
         return CellLight(np.zeros((len(self._lights), 0, 3), np.float32), self.radiance)
+
+    def _number(self, image: F32 | None) -> int:
+        if image is None or not np.size(image):
+            return 0
+        self._n_images += 1
+        return self._n_images
 
     def _checked(self, light: int) -> int:
         if not 0 <= light < len(self._lights):

@@ -82,7 +82,7 @@ class Evaluator:
             # Known before it is done: some lights may have changed when another one refuses.
             self._shown = replace(before, lights=state.lights)
             self._show_lights(before, state)
-            self._seen.update(self.lights.snapshot())
+            self._seen.update(self.lights.snapshot(), self.lights.images)
         self.relighter.set_stack(self._laid_over(stack, state))
         self._shown, self._stack = state, stack
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,14 +25,20 @@ class SeenLight:
 
     def __init__(self, snapshot: SceneSnapshot, view: ViewSamples) -> None:
         self._snapshot, self._own = snapshot, view
-        self._key = self._key_of(snapshot)
+        self._key = self._key_of(snapshot, (0,) * len(snapshot.light_paths))
         self._known = self._key
         self.view = view  #: with the sky and the glow as they are now
         self.difference: F32 | None = None  #: (height, width, 3) that they add to the stage's own; None is none
 
-    def update(self, now: SceneSnapshot) -> None:
-        """Look at lights that may have changed."""
-        key = self._key_of(now)
+    def update(self, now: SceneSnapshot, images: Sequence[int]) -> None:
+        """Look at lights that may have changed.
+
+        Parameters
+        ----------
+        now, images
+            `LiveLights.snapshot` and `LiveLights.images`.
+        """
+        key = self._key_of(now, images)
         if key == self._known:
             return
         self._known = key
@@ -61,13 +68,9 @@ class SeenLight:
                 emission = np.where((surface == own.surface[row])[:, None], emission * factor, emission)
         return np.ascontiguousarray(emission, np.float32)
 
-    def _key_of(self, now: SceneSnapshot) -> tuple[tuple[str, int], ...]:
-        """What the lights that are seen are; new images are told apart by where their texels lie, not by their row."""
-        lights, textures = now.lights, now.textures
-        found = []
-        for row in np.flatnonzero(np.isin(lights.kind, (LightKind.DOME, LightKind.MESH))).tolist():
-            image, place = int(lights.texture[row]), -1
-            if image >= len(self._snapshot.textures.begin):
-                place = textures.texels.ctypes.data + int(textures.begin[image]) * textures.texels.strides[0]
-            found.append((light_digest(lights, row), place))
-        return tuple(found)
+    @staticmethod
+    def _key_of(now: SceneSnapshot, images: Sequence[int]) -> tuple[tuple[str, int], ...]:
+        """What the lights that are seen are; images are told apart by their numbers, as rows are used again."""
+        lights = now.lights
+        seen = np.flatnonzero(np.isin(lights.kind, (LightKind.DOME, LightKind.MESH))).tolist()
+        return tuple((light_digest(lights, row), images[row]) for row in seen)

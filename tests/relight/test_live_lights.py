@@ -241,8 +241,28 @@ def test_the_sky_behind_a_view_follows_every_image(scene: Pipeline) -> None:
     lights, seen = build(pipeline), SeenLight(snapshot, pipeline.view)
     for level in (2.0, 3.0):
         lights.change(0, radiance=(1, 1, 1), texture=np.full((4, 8, 3), level, np.float32))
-        seen.update(lights.snapshot())
+        seen.update(lights.snapshot(), lights.images)
         np.testing.assert_allclose(seen.view.background, level, rtol=1e-5)
+
+
+def test_the_sky_follows_every_image_of_two_domes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However often arrays of texels are freed, and new ones lie where they lay."""
+    monkeypatch.setattr(LiveLights, "_show", lambda *_: None)  # what they light does not matter here
+    away = look_at((0, 5, 0), (0, 9, 0.1), width=4, height=4)
+    snapshot = make_snapshot(cornell_meshes(), camera=away, lights=[replace(DOME, path="/a"), replace(DOME, path="/b")])
+    pipeline = Pipeline(snapshot, n_gather=30, bounce_rays=16)
+    lights, seen = build(pipeline), SeenLight(snapshot, pipeline.view)
+    levels = [0.0, 0.0]
+
+    def show(light: int, level: float) -> None:
+        levels[light] = level
+        lights.change(light, radiance=(1, 1, 1), texture=np.full((256, 512, 3), level, np.float32))
+
+    show(0, 1.0)
+    for light, level in [*((1, 2.0 + k) for k in range(16)), *((0, 30.0 + k) for k in range(6))]:
+        show(light, level)
+        seen.update(lights.snapshot(), lights.images)
+        np.testing.assert_allclose(seen.view.background, sum(levels), rtol=1e-5)
 
 
 def test_a_camera_that_sees_no_surface_needs_no_light() -> None:
