@@ -498,7 +498,7 @@ class LiveRelighter:
 
     def _edit(self, samples: I64) -> None:
         """Find the light of those of some samples that do not share theirs."""
-        samples = samples[self._mixed[samples]]
+        samples = samples[self._mixed[samples]] if len(self._mixed_samples) else samples[:0]
         if not len(samples):
             return
         light = np.take(self._unedited(), samples, axis=0)
