@@ -25,11 +25,18 @@ def fit_weights(records: Records, survey: Survey, tint: F32) -> Records:
     that faces alike and of those that it had, that is closest to its own light
     under the training lights, by least squares with the given weights as a prior. The rays of the survey are the
     same everywhere, so what is noise in one place is noise in the other.
+    Both halves of the survey take part in fits and judge them: more light to
+    fit with is worth more than a judge who has not seen it.
 
     Parameters
     ----------
     tint : (3, n_view)
         Of the lobes, scalar.
+
+    Returns
+    -------
+    Records
+        `error` is what the fits leave of the survey that they were made from, a lower bound: no estimate for others.
     """
     mesh, view = records.mesh, records.mesh.view
     judge = Judge(survey, tint, records, view.height, view.width, view.pixel)

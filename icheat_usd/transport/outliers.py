@@ -55,7 +55,7 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
     Returns
     -------
     Records
-        Those given come first; `error` is the one expected now.
+        Those given come first; `error` is what the survey leaves, a lower bound: its rays have chosen the records.
     """
     mesh = records.mesh
     view = mesh.view

@@ -44,7 +44,10 @@ class Pieces:
         return made
 
     def measured(self, samples: I64, n_rays: int, make: Callable[[I64], MeasuredRows]) -> MeasuredRows:
-        """Rows of some samples; what `make` gives for each of them must not depend on the others."""
+        """Rows of some samples, which must not depend on how these are divided.
+
+        As near as `RowBuilder.measure` holds to that: a build that goes on is divided as it was, to the same bits.
+        """
         found = self._divided(samples, n_rays, make)
         if len(found) == 1:
             return found[0]

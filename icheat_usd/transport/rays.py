@@ -114,7 +114,8 @@ class RowBuilder:
 
         Notes
         -----
-        Bitwise the same for any number of threads, and each row the same whatever rows it is measured with.
+        Bitwise the same for any number of threads. Each row is the same whatever rows it is measured with, but for
+        rays on an edge between triangles: which of the two a ray of a packet meets can depend on the rays beside it.
         Memory: 64 MB beside the rows.
         """
         rays = _Rays(

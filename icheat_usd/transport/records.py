@@ -56,7 +56,9 @@ class Records:
 
     view: I32  #: (n,) view samples
     interpolation: SparseRows  #: (n_view x n) rows sum to 1
-    error: float  #: relative RMS error expected of the training lights; inf before the first test
+    #: Relative RMS error expected of the training lights; inf before the first test. Less than the true one after
+    #: records or weights were chosen by what it is judged by: see `add_outliers` and `fit_weights`.
+    error: float
     fit: F32  #: (n_view,) share of each sample that comes from the corners of its block
     mesh: Mesh  #: what they were made from, which changes with the next
 

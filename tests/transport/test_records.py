@@ -286,7 +286,7 @@ def test_fitted_weights_find_the_records_that_see_the_same() -> None:
 
 
 def test_fitted_weights_take_no_light_from_another_object() -> None:
-    # A shelf beside a floor in the image: the lights known make patterns that both share, another meets the shelf alone.
+    # A shelf beside a floor. The lights known make patterns that both share, another meets the shelf alone.
     shelf = Mesh(quad(4), transforms=[translation(2, 0.15, 0)], path="/shelf")
     scene = make_snapshot([Mesh(quad(8), path="/floor"), shelf], camera=look_at((0, 5, 0.01), width=64, height=64))
     view = view_of(scene)
