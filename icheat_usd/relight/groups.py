@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels import terms as kernels
 from icheat_usd.kernels.versions import COMPOSE
 from icheat_usd.relight.compiled import CompiledStack, Way
 from icheat_usd.relight.version_lists import VersionKey
@@ -44,7 +44,7 @@ class GroupTerms(NamedTuple):
 
 
 class TermTable(NamedTuple):
-    """Terms of all groups as arrays, see `kernels.versions.add_terms`."""
+    """Terms of all groups as arrays, see `kernels.terms.add_terms`."""
 
     term_begin: I64
     term_version: I32

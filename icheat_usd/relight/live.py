@@ -14,7 +14,7 @@ from icheat_usd.edits.bound import Ends, sent_anew
 from icheat_usd.edits.history import History
 from icheat_usd.edits.model import EditStack, SurfaceMask
 from icheat_usd.errors import EditError, SampleSetMismatch
-from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels import terms as kernels
 from icheat_usd.kernels.assemble import sum_scaled
 from icheat_usd.kernels.film_table import FilmTable, film_table
 from icheat_usd.relight.alone import AloneSamples

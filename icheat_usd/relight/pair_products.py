@@ -14,7 +14,7 @@ from icheat_usd.edits.bound import Aggregate, Ends
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import PAIRS_AT_ONCE
 from icheat_usd.edits.operations import Level, PairCoefficients
-from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels import version_products as kernels
 from icheat_usd.materials import take_points
 from icheat_usd.relight.compiled import CompiledStack
 from icheat_usd.samples import GatherSamples, ViewSamples

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels import version_products as kernels
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
@@ -46,7 +46,7 @@ class VersionTables(NamedTuple):
     cells: I32
     node_begin: I64
     nodes: I32
-    child: I32  #: (n_nodes, 2) see `kernels.versions.haar_of_cells`
+    child: I32  #: (n_nodes, 2) see `kernels.version_products.haar_of_cells`
     set_begin: I64
     sets: U8
     sign: F64

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels import version_products as kernels
 from icheat_usd.kernels.assemble import assemble_film, assemble_view, chunks_in_order
 from icheat_usd.kernels.film_table import FilmTable
 from icheat_usd.relight.direct_sum import SummedLight

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icheat_usd.kernels import versions as kernels
+from icheat_usd.kernels import terms as kernels
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.groups import GroupTerms, SampleGroups, Term, TermTable, reach_of
 from icheat_usd.relight.live_stack import LiveStack
@@ -63,7 +63,7 @@ class TermTables:
     def add(
         self, table: TermTable, samples: I64, masks: F32, own: F32, products: Products, albedo: F32, out: F32
     ) -> None:
-        """Add the terms of some samples to `out`; see `kernels.versions.add_terms`."""
+        """Add the terms of some samples to `out`; see `kernels.terms.add_terms`."""
         if not len(table.term_version) or not len(samples):
             return
         spread, versions = products.interpolation, self._versions
