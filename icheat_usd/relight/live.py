@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from icheat_usd.edits.bound import Ends, sent_anew
-from icheat_usd.edits.history import History
 from icheat_usd.edits.model import EditStack, SurfaceMask
 from icheat_usd.errors import EditError, SampleSetMismatch
 from icheat_usd.kernels import terms as kernels
@@ -91,7 +90,6 @@ class LiveRelighter:
         self._light_stale = True
         self._changed_rows: set[int] = set()
         self._stack = LiveStack(snapshot, view, gather, True)
-        self._history: History | None = None
         self.set_transport(transport)
 
     # Commands ---------------------------------------------------------------------------------------------------------
@@ -186,38 +184,6 @@ class LiveRelighter:
         if sorted(edit_paths) != sorted(edits):
             raise EditError(f"an order of the stack names each of {', '.join(sorted(edits))} once")
         self.set_stack(replace(self.stack, edits=tuple(edits[path] for path in edit_paths), digest=""))
-
-    def commit(self) -> None:
-        """Make what is shown a step that can be undone; the first commit is where undoing ends."""
-        self._history = History((self.stack,)) if self._history is None else self._history.committed(self.stack)
-
-    def undo(self) -> None:
-        """Go back to the last commit that differs from what is shown.
-
-        Raises
-        ------
-        EditError
-            There is none.
-        """
-        self.commit()
-        assert self._history is not None
-        self._go_to(self._history.undone())
-
-    def redo(self) -> None:
-        """Undo the last undo.
-
-        Raises
-        ------
-        EditError
-            Nothing was undone since the last change.
-        """
-        self.commit()
-        assert self._history is not None
-        self._go_to(self._history.redone())
-
-    def _go_to(self, history: History) -> None:
-        self.set_stack(history.stack)
-        self._history = history
 
     @property
     def stack(self) -> EditStack:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from dataclasses import replace
 from typing import Any
@@ -108,11 +107,11 @@ def repainted(mask: SurfaceMask, rng: np.random.Generator) -> SurfaceMask:
 
 
 #: Most of them leave what the next ones build on.
-COMMANDS = ["amount"] * 6 + ["dab"] * 3 + ["mute", "reorder", "undo", "redo", "gain", "commit", "refine"]
+COMMANDS = ["amount"] * 6 + ["dab"] * 3 + ["mute", "reorder", "back", "gain", "keep", "refine"]
 #: Nearly all of them change which edits there are, or what these are.
 STRUCTURAL = [
     *("mute", "mute", "mute", "reorder", "reorder", "swap", "swap", "add", "remove", "mask", "mask", "dab", "dab"),
-    *("dab and mute", "number", "number and mute", "blend", "amount", "undo", "redo", "gain", "commit", "refine"),
+    *("dab and mute", "number", "number and mute", "blend", "amount", "back", "gain", "keep", "refine"),
 ]
 
 
@@ -155,6 +154,7 @@ def changed_stack(stack: EditStack, command: str, rng: np.random.Generator) -> E
 
 def act_at_random(shown: LiveRelighter, rng: np.random.Generator, n_steps: int, commands: list[str] = COMMANDS) -> None:
     """Commands on a stack of edits, and frames and refinements between them."""
+    kept = [shown.stack]
     for step in range(n_steps):
         path, command = str(rng.choice([edit.path for edit in shown.stack.edits])), str(rng.choice(commands))
         if command == "amount":
@@ -171,13 +171,12 @@ def act_at_random(shown: LiveRelighter, rng: np.random.Generator, n_steps: int, 
                 chosen = painted[rng.integers(len(painted))]
                 mask = getattr(chosen.keys[-1].payload, name)
                 shown.dab(chosen.path, side, repainted(mask, rng), key=len(chosen.keys) - 1)
-        elif command in ("undo", "redo"):
-            with contextlib.suppress(EditError):
-                getattr(shown, command)()
+        elif command == "back":
+            shown.set_stack(kept[rng.integers(len(kept))])
         elif command == "gain":
             shown.lights.set_gain(int(rng.integers(2)), rng.uniform(0, 2, 3))
-        elif command == "commit":
-            shown.commit()
+        elif command == "keep":
+            kept.append(shown.stack)
         elif command == "refine":
             shown.refine()
         else:
@@ -217,7 +216,6 @@ STACKS = {
 def test_the_same_state_has_the_same_bits_whatever_led_to_it(stack):
     of = pipeline("full")
     shown = fresh(of, STACKS[stack], np.ones((2, 3), np.float32))
-    shown.commit()
     rng = np.random.default_rng(len(stack))
     for _ in range(8):
         act_at_random(shown, rng, 4)
@@ -236,7 +234,6 @@ def test_stacks_of_other_edits_have_the_bits_of_fresh_ones(stack, spare, monkeyp
     monkeypatch.setattr("icheat_usd.relight.live.MOST_VERSIONS", 4 if spare == 0 else 192)
     of = pipeline("full")
     shown = fresh(of, STACKS[stack], np.ones((2, 3), np.float32))
-    shown.commit()
     rng = np.random.default_rng(len(stack) + spare)
     for _ in range(20):
         act_at_random(shown, rng, 2, STRUCTURAL)
@@ -536,7 +533,6 @@ def test_packed_light_ends_in_the_same_bits_whatever_led_to_it(stack, monkeypatc
     monkeypatch.setattr("icheat_usd.relight.narrow.NARROW_BYTES", rows.n_bytes // 4)
     shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, RestingLights(of))
     shown.set_stack(STACKS[stack])
-    shown.commit()
     with monkeypatch.context() as patch:
         patch.setattr("icheat_usd.relight.products._ENTRIES_AT_ONCE", 100)
         patch.setattr("icheat_usd.relight.versions._PAIRS_AT_ONCE", 1)
@@ -603,8 +599,6 @@ def test_mistakes_are_told():
         (lambda: shown.dab("/a", "lights", soft_mask("/floor", 1)), "'lights' cannot be painted"),
         (lambda: shown.dab("/a", "receivers", soft_mask("/floor", 1), key=2), "no painted key 2"),
         (lambda: shown.reorder(["/a", "/a"]), "names each of /a once"),
-        (lambda: shown.undo(), "nothing to undo"),
-        (lambda: shown.redo(), "nothing to redo"),
     ):
         with pytest.raises(EditError, match=message):
             command()
