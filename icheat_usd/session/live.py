@@ -416,11 +416,15 @@ class LiveSession(LiveAuthoring):
         return {frame: entry.level for frame, entry in found.items() if entry is not None}
 
     def memory(self) -> dict[str, int]:
-        """Bytes of arrays: `total` of all frames, `limit`, and of the frame at the playhead `frame` and its `own`."""
+        """Bytes of arrays: `total` of all frames, `limit`, and of the frame at the playhead `frame` and its `own`.
+
+        Beside them `history`: of the steps that can be undone and redone, which has a limit of its own.
+        """
         with self._frames.command():
             resident = self._frames.resident
             whole, own = resident.bytes_of(resident.playhead) if self.level is not Level.NONE else (0, 0)
-            return {"total": resident.bytes(), "limit": resident.limit, "frame": whole, "own": own}
+            found = {"total": resident.bytes(), "limit": resident.limit, "frame": whole, "own": own}
+            return found | {"history": self._history.bytes}
 
     # Inside -----------------------------------------------------------------------------------------------------------
 

@@ -203,12 +203,13 @@ def test_undo_of_a_commit_is_refused_when_someone_else_wrote_to_the_layer(stage:
 
 def test_a_dab_changes_what_lies_under_it_and_nothing_else(live: LiveSession) -> None:
     live.fill_mask("warm", 0.0)
-    none = live.frame()
+    none, kept = live.frame(), live.memory()["history"]
     surface, place = live.pick(4, 13)
     assert surface == "/World/Room"
     live.dab("warm", place, 0.6)
     changed = np.abs(live.frame() - none).max(axis=2)
     assert changed[13, 4] > 0 and (changed == 0).mean() > 0.5
+    assert live.memory()["history"] > kept > 0, "masks that undo brings back take memory"
     live.dab("warm", place, 0.6, strength=-1.0)
     assert np.abs(live.frame() - none).max() <= changed.max()
 
