@@ -228,6 +228,23 @@ def black(builder: Any, values: Any) -> Any:
     return ir.Constant(_F4X, [0.0] * 4)
 
 
+@_operation(color, types.float32, types.float32, types.float32)
+def color_of(builder: Any, values: Any) -> Any:
+    """Red, green and blue, and 0."""
+    found = ir.Constant(_F4X, [0.0] * 4)
+    for lane, value in enumerate(values):
+        found = builder.insert_element(found, value, ir.Constant(_I32, lane))
+    return found
+
+
+@_operation(types.boolean, color)
+def is_black(builder: Any, values: Any) -> Any:
+    """Whether red, green and blue are all 0."""
+    rgb = _picked(builder, values[0], values[0], [0, 1, 2])
+    bits = builder.bitcast(builder.fcmp_unordered("!=", rgb, ir.Constant(rgb.type, [0.0] * 3)), ir.IntType(3))
+    return builder.icmp_unsigned("==", bits, ir.Constant(ir.IntType(3), 0))
+
+
 @_operation(color, types.int64)
 def load_color(builder: Any, values: Any) -> Any:
     """Four float32 from an address."""

@@ -6,6 +6,21 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.simd import (
+    address_of,
+    black,
+    color_add,
+    color_of,
+    color_product,
+    is_black,
+    load_color,
+    load_rgb,
+    scale_add,
+    scaled,
+    store_rgb,
+)
+
+_CHUNK = 256  # samples
 
 
 @kernel
@@ -58,48 +73,95 @@ def add_terms(  # type: ignore[no-untyped-def]
     offsets : (n_versions, 6) light without transport, to be reflected and not
     out : (n, 3) float32
     """
-    for k in prange(len(samples)):
+    n = len(samples)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        _add_terms_run(
+            chunk * _CHUNK,
+            min(n, chunk * _CHUNK + _CHUNK),
+            samples,
+            group,
+            term_begin,
+            term_version,
+            term_factor_begin,
+            term_factor,
+            masks,
+            n_rows,
+            own,
+            sparse,
+            indptr,
+            indices,
+            weights,
+            pair_of,
+            products,
+            tints,
+            albedo,
+            offsets,
+            out,
+        )
+
+
+@kernel
+def _add_terms_run(  # type: ignore[no-untyped-def]
+    first,
+    end,
+    samples,
+    group,
+    term_begin,
+    term_version,
+    term_factor_begin,
+    term_factor,
+    masks,
+    n_rows,
+    own,
+    sparse,
+    indptr,
+    indices,
+    weights,
+    pair_of,
+    products,
+    tints,
+    albedo,
+    offsets,
+    out,
+):
+    """`add_terms` for some of the samples."""
+    product_0, tint_0, albedo_0 = address_of(products), address_of(tints), address_of(albedo)
+    own_0, out_0 = address_of(own), address_of(out)
+    product_step, tint_step = 1024 * products.shape[1], 12 * tints.shape[1]
+    one = np.float32(1)
+    for k in range(first, end):
         s = samples[k]
+        total = load_rgb(out_0 + 12 * k)
         for term in range(term_begin[group[s]], term_begin[group[s] + 1]):
             version = term_version[term]
-            red = np.float32(1)
-            green = np.float32(1)
-            blue = np.float32(1)
+            factor = color_of(one, one, one)
             for f in range(term_factor_begin[term], term_factor_begin[term + 1]):
                 row = term_factor[f]
                 if row < n_rows:
-                    red *= masks[row, s]
-                    green *= masks[row, s]
-                    blue *= masks[row, s]
+                    factor = scaled(factor, masks[row, s])
                 else:
-                    red *= own[k, row - n_rows, 0]
-                    green *= own[k, row - n_rows, 1]
-                    blue *= own[k, row - n_rows, 2]
-            r = np.float32(offsets[version, 0]) * albedo[s, 0] + np.float32(offsets[version, 3])
-            g = np.float32(offsets[version, 1]) * albedo[s, 1] + np.float32(offsets[version, 4])
-            b = np.float32(offsets[version, 2]) * albedo[s, 2] + np.float32(offsets[version, 5])
+                    factor = color_product(factor, load_rgb(own_0 + 12 * (k * own.shape[1] + row - n_rows)))
+            o = offsets[version]
+            reflected = color_of(np.float32(o[0]), np.float32(o[1]), np.float32(o[2]))
+            emitted = color_of(np.float32(o[3]), np.float32(o[4]), np.float32(o[5]))
+            light = color_add(reflected, load_rgb(albedo_0 + 12 * s), emitted)
             for lobe in range(len(products)):
-                x = np.float32(0)
-                y = np.float32(0)
-                z = np.float32(0)
+                tint = load_rgb(tint_0 + lobe * tint_step + 12 * s)
+                if is_black(tint):
+                    continue
+                of_lobe = product_0 + lobe * product_step
                 if sparse == 0:
-                    pair = pair_of[version, s >> 6]
-                    x = products[lobe, pair, s & 63, 0]
-                    y = products[lobe, pair, s & 63, 1]
-                    z = products[lobe, pair, s & 63, 2]
+                    pair = np.int64(pair_of[version, s >> 6])
+                    sent = load_color(of_lobe + 1024 * pair + 16 * (s & 63))
                 else:
+                    sent = black()
                     for entry in range(indptr[s], indptr[s + 1]):
-                        pair = pair_of[version, indices[entry] >> 6]
-                        lane = indices[entry] & 63
-                        x += weights[entry] * products[lobe, pair, lane, 0]
-                        y += weights[entry] * products[lobe, pair, lane, 1]
-                        z += weights[entry] * products[lobe, pair, lane, 2]
-                r += tints[lobe, s, 0] * x
-                g += tints[lobe, s, 1] * y
-                b += tints[lobe, s, 2] * z
-            out[k, 0] += red * r
-            out[k, 1] += green * g
-            out[k, 2] += blue * b
+                        pair = np.int64(pair_of[version, indices[entry] >> 6])
+                        place = of_lobe + 1024 * pair + 16 * np.int64(indices[entry] & 63)
+                        sent = scale_add(load_color(place), weights[entry], sent)
+                light = color_add(sent, tint, light)
+            total = color_add(factor, light, total)
+        store_rgb(out_0 + 12 * k, total)
 
 
 @parallel_kernel
