@@ -6,7 +6,7 @@ import numpy as np
 
 from icheat_usd.kernels.residuals import add_light_residuals, proportions
 from icheat_usd.relight.products import Products
-from icheat_usd.scene import F32, I64, Bool
+from icheat_usd.scene import F32, I32, I64, Bool
 from icheat_usd.transport.packed import LANES
 
 #: Memory of the narrowed tiles: two cores read it in some tenths of a millisecond.
@@ -73,14 +73,19 @@ class Narrow:
         for light in np.flatnonzero(~is_same).tolist():
             rest += self._rest(light, radiance[light], factors) * gains[light]
 
-        def add(products: F32) -> None:
-            flat = products.reshape(*products.shape[:2], 4 * LANES)
-            add_light_residuals(self._known, factors, self._exact.n_tiles, flat)
+        n_tiles = self._exact.n_tiles
+        every = np.arange(n_tiles, dtype=np.int32)
+
+        def add(products: F32, tile: I32) -> None:
+            known = self._known
+            if len(tile) < n_tiles:
+                known = known[:, (np.arange(len(products))[:, None] * n_tiles + tile).ravel()]
+            add_light_residuals(known, factors, len(tile), products.reshape(*products.shape[:2], 4 * LANES))
 
         if is_same.all() and len(is_same):
-            out[:, : self._exact.n_tiles] = 0
-            add(out)
-            self._products.see(out)
+            out[:, :n_tiles] = 0
+            add(out, every)
+            self._products.see(out, every)
         else:
             self._products.multiply_all(rest, out, known=add)
 

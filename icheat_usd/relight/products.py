@@ -14,7 +14,7 @@ from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
-from icheat_usd.scene import F32, F64, I32, I64, U8
+from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
 from icheat_usd.transport import SparseRows, Transport
 from icheat_usd.transport.packed import LANES, LargeTerms, PackedRows, PackedTransport
 
@@ -29,8 +29,10 @@ LEFT_OUT = 0.003
 LEFT_OUT_OF_VERSION = 0.0015
 #: More than this is not read for light not seen before, whatever is left out.
 MOVING_BYTES = 80_000_000
-#: What is read first of light not seen before, to find how bright the image will be.
-_FIRST_BYTES = 4_000_000
+#: Terms that are looked at to find which are large: in unedited light, and in a version.
+_LOOKED_AT = 32_768, 4_096
+#: Of light not seen before, the products of so many tiles tell how bright the image will be.
+_TILES_LOOKED_AT = 16
 #: Entries of uncompressed rows that are multiplied in one step of a refinement: some hundredths of a second.
 _ENTRIES_AT_ONCE = 5_000_000
 #: Versions that are transformed at once.
@@ -113,12 +115,16 @@ class Products:
         self.n_tiles = -(-(n_view if spread is None else spread.n_columns) // LANES)
         self._versions: F32 = np.zeros((0, self._n_leaves, 4), np.float32)
         self._sizes: F32 = np.zeros((0, self._n_leaves), np.float32)  # largest channels of the versions
+        self._is_large: Bool = np.zeros(0, np.bool_)  # versions that have many cells
         if self._haar:
             self._parent_of_leaf, self._parent = _parents(tree)
             self._share, self._root = _shares(tree)
             self._plan = plan_haar(tree)
             is_large = self._packed is not None and self._tiles is not None and self._packed.n_bytes > SMALL_BYTES
-            self._large_terms = LargeTerms(self._packed) if is_large and self._packed is not None else None
+            # There can be many versions in a frame, which are looked at more coarsely.
+            self._large_terms, self._few_terms = (
+                LargeTerms(self._packed, n) if is_large and self._packed is not None else None for n in _LOOKED_AT
+            )
             self._counts = self._weights_of_rows() if is_large else np.zeros((0, 0, LANES), np.float32)
             self._shown = 0.0  # sum over pixels of the squared unedited light that was multiplied last
             self._leaves: F32 = np.zeros((_TOGETHER, self._n_leaves, 3), np.float32)
@@ -152,7 +158,7 @@ class Products:
     def keep(self, versions: I64) -> None:
         """Forget all but some versions (ascending), and number these anew, in their order."""
         n = len(versions)
-        for values in (self._versions, self._sizes):
+        for values in (self._versions, self._sizes, self._is_large):
             for new, old in enumerate(versions):
                 values[new] = values[old]
         self._versions[n:] = 0
@@ -166,6 +172,7 @@ class Products:
             sizes = np.zeros(grown.shape[:2], np.float32)
             sizes[: len(self._sizes)] = self._sizes
             self._sizes = sizes
+            self._is_large = np.append(self._is_large, np.zeros(len(grown) - len(self._is_large), np.bool_))
 
     def nodes(self, cells: I32) -> tuple[I32, I32]:
         """Nodes of the tree above some cells and their children; nothing where no wavelets are needed."""
@@ -185,6 +192,7 @@ class Products:
             kernels.spread_cells(versions, tables.cell_begin, tables.cells, deltas, self._versions)
             return
         large = np.diff(tables.cell_begin)[versions] > _MANY_CELLS
+        self._is_large[versions] = large
         if not large.all():
             kernels.haar_of_cells(
                 versions[~large],
@@ -209,7 +217,7 @@ class Products:
     def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:
         """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows.
 
-        Of a large transport, only the terms are read that are large in a version, seen beside the unedited light;
+        Of a large transport, only the terms are read that are large in a large version, seen beside the unedited light;
         see `LEFT_OUT_OF_VERSION`. Each version is seen alone, so that it does not matter which change together.
         """
         if not len(pairs):
@@ -224,17 +232,15 @@ class Products:
             return
         least = np.full(len(self._versions), np.finfo(np.float32).tiny, np.float32)
         if self._large_terms is not None and not narrow:
-            for v in np.unique(version):
+            for v in np.unique(version[self._is_large[version]]):
                 least[v] = max(self._least_of(int(v)), least[v])
         tiles.multiply(self._versions, self._sizes, least, tile, version, pairs, out)
 
     def _least_of(self, version: int) -> float:
-        """Least terms of a version that count; 0 where it has few."""
-        assert self._large_terms is not None
-        size = self._sizes[version]
-        if np.count_nonzero(size) < _MANY_CELLS:
-            return 0.0
-        return self._large_terms.least_of_error(size, LEFT_OUT_OF_VERSION**2 * self._shown, MOVING_BYTES)
+        """Least terms of a version that count."""
+        assert self._few_terms is not None
+        error = LEFT_OUT_OF_VERSION**2 * self._shown
+        return self._few_terms.least_of_error(self._sizes[version], error, MOVING_BYTES)
 
     def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
         """Products of some tiles of uncompressed rows with values (n, 3) that are 0 but at some cells."""
@@ -269,7 +275,9 @@ class Products:
             self._multiply_floats(rows, values, tile, np.zeros_like(tile), out[lobe, first:end])
         return end
 
-    def multiply_all(self, b: F32, out: F32, narrow: bool = False, known: Callable[[F32], None] | None = None) -> None:
+    def multiply_all(
+        self, b: F32, out: F32, narrow: bool = False, known: Callable[[F32, I32], None] | None = None
+    ) -> None:
         """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``; `narrow`: as `multiply`.
 
         Of a large transport, only the terms that are large in this light are read; see `LEFT_OUT`.
@@ -277,7 +285,7 @@ class Products:
         Parameters
         ----------
         known
-            Adds to the products what is known of others, so that together they are the unedited light.
+            Adds to the products of some tiles what is known of others, so that together they are the unedited light.
         """
         tile = np.arange(self.n_tiles, dtype=np.int32)
         if not self._haar:
@@ -293,36 +301,31 @@ class Products:
             else:
                 tiles.multiply(values, _NONE, _NONE[0], tile, 0 * tile, tile.astype(np.int64), out)
             if known is not None:
-                known(out)
+                known(out, tile)
             return
         size = np.empty((1, self._n_leaves), np.float32)
         largest_channels(np.zeros(1, np.int64), values, size)
         size[0, 0] = np.inf  # means stay, however dark it is
-        # How bright the image is follows from the largest terms, not from the last frame: same light, same bits.
-        first = self._large_terms.least(size[0], _FIRST_BYTES)
-        self._multiply_large(values, size, first, out, known)
-        self.see(out)
-        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
-        if least < first:
-            self._multiply_large(values, size, least, out, known)
-
-    def _multiply_large(
-        self, values: F32, size: F32, least: float, out: F32, known: Callable[[F32], None] | None
-    ) -> None:
-        """Products of all tiles with the terms of `least` and more, and what is known."""
-        assert self._tiles is not None
-        tile = np.arange(self.n_tiles, dtype=np.int32)
-        leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
-        self._tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out)
+        # How bright the image is follows from this light, not from the last frame: the same light, the same bits.
+        some = tile[:: max(1, len(tile) // _TILES_LOOKED_AT)]
+        looked_at = self.room(len(some))
+        tiles.multiply(values, _NONE, _NONE[0], some, 0 * some, np.arange(len(some)), looked_at)
         if known is not None:
-            known(out)
+            known(looked_at, some)
+        self.see(looked_at, some)
+        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
+        leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
+        tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out)
+        if known is not None:
+            known(out, tile)
 
-    def see(self, products: F32) -> None:
-        """Take products of all tiles for those of the unedited light, beside which others are large or small."""
+    def see(self, products: F32, tile: I32) -> None:
+        """Take products of some tiles for those of the unedited light, beside which others are large or small."""
         if self._haar and self._large_terms is not None:
-            found = np.empty(self._counts.shape[0] * self._counts.shape[1])
-            squares_of_tiles(products.reshape(*products.shape[:2], 4 * LANES), self._counts, found)
-            self._shown = float(found.sum())
+            counts = self._counts[:, tile]
+            found = np.empty(counts.shape[0] * counts.shape[1])
+            squares_of_tiles(products.reshape(*products.shape[:2], 4 * LANES), counts, found)
+            self._shown = float(found.sum()) * self.n_tiles / max(len(tile), 1)
 
     def _weights_of_rows(self) -> F32:
         """What the square of each product counts in all pixels, mean of the channels: (n_lobes, n_tiles, 64)."""

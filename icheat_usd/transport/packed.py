@@ -16,7 +16,6 @@ from icheat_usd.transport.build import Transport
 from icheat_usd.transport.sparse import SparseRows
 
 LANES = 64  #: rows of a tile
-_SAMPLED = 32_768  # terms that stand for all
 _BYTES_OF_TERM = LANES + 8
 
 
@@ -184,13 +183,13 @@ class LargeTerms:
     a quarter of the coefficients serves nearly as well as all.
     """
 
-    def __init__(self, transport: PackedTransport, seed: int = 0) -> None:
+    def __init__(self, transport: PackedTransport, n_looked_at: int = 32_768, seed: int = 0) -> None:
         rows = [lobe.rows for lobe in transport.lobes]
         begin = np.concatenate([[0], np.cumsum([len(of_lobe.index) for of_lobe in rows])])
         self.n_terms = int(begin[-1])  #: of all lobes
         sample = np.arange(self.n_terms)
-        if self.n_terms > _SAMPLED:
-            sample = np.sort(np.random.default_rng(seed).integers(self.n_terms, size=_SAMPLED))
+        if self.n_terms > n_looked_at:
+            sample = np.sort(np.random.default_rng(seed).integers(self.n_terms, size=n_looked_at))
         parts = [
             (of_lobe, sample[(sample >= first) & (sample < last)] - first)
             for of_lobe, first, last in zip(rows, begin[:-1], begin[1:], strict=True)

@@ -477,7 +477,6 @@ def test_a_large_transport_is_read_in_part_while_lights_move(monkeypatch):
     gains = np.ones((2, 3), np.float32)
     whole = fresh_packed(of, rows, stack, gains).relit()
     monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
-    monkeypatch.setattr("icheat_usd.relight.products._FIRST_BYTES", rows.n_bytes // 50)
     errors = []
     for left_out, limit in ((0.02, 10**9), (0.1, 10**9), (0.0, rows.n_bytes // 8)):
         monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", left_out)
@@ -499,7 +498,6 @@ def test_a_light_that_goes_down_at_once_has_the_terms_that_are_large_in_what_is_
     """The limit of what is left out is that of the image as it is, not as it was one frame ago."""
     of, rows = pipeline("full"), poor(packed("full"))
     monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
-    monkeypatch.setattr("icheat_usd.relight.products._FIRST_BYTES", rows.n_bytes // 50)
     monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", 0.01)
     shown = fresh_packed(of, rows, EditStack("/none", ()), np.ones((2, 3), np.float32))
     shown.frame()
@@ -658,7 +656,6 @@ def test_products_do_not_depend_on_what_was_shown_before(monkeypatch):
     monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", 0.05)
     monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT_OF_VERSION", 0.05)
     monkeypatch.setattr("icheat_usd.relight.products._MANY_CELLS", 16)
-    monkeypatch.setattr("icheat_usd.relight.products._FIRST_BYTES", rows.n_bytes // 50)
     stack = EditStack(
         "/stack",
         (
