@@ -275,7 +275,7 @@ class LiveFrames:
                 self._tell(LiveEvent("surfaces", number, frame.level, image=look))
             for transport in parts.transports():
                 if evaluator is None:
-                    evaluator = self._evaluator(parts, transport, level)
+                    evaluator = self._evaluator(parts, frame, transport, level)
                     self._show(
                         number,
                         frame,
@@ -293,12 +293,14 @@ class LiveFrames:
             self._show(number, frame, evaluator, level, began)
         self._forget_parts(number, *((level,) if level is Level.PREVIEW else Level))
 
-    def _evaluator(self, parts: ShotParts, transport: Transport | PackedTransport, level: Level) -> Evaluator:
+    def _evaluator(
+        self, parts: ShotParts, frame: LiveFrame, transport: Transport | PackedTransport, level: Level
+    ) -> Evaluator:
         """At the state already: without the lock, as lights that were changed are worked out here."""
         with self._background.lock:
-            state = self.state
+            stack, state = self.stack_of(frame), self.state
         evaluator = Evaluator(parts, transport, is_coarse=level is Level.PREVIEW)
-        evaluator.show(self._read_stack(parts.snapshot), state)
+        evaluator.show(stack, state)
         # Its kernels are compiled here if need be: who asks for the image would wait for whatever is compiled next.
         evaluator.frame()
         return evaluator

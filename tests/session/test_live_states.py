@@ -12,8 +12,10 @@ import numba
 import numpy as np
 import pytest
 
+from icheat_usd.edits.model import EditStack
 from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.kernels.compiling import told_of_compiling
+from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.session import Quality, Session, shot_parts
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_events import LiveEvent
@@ -220,6 +222,22 @@ def test_a_frame_that_cannot_be_shown_is_tried_once(stage: Path, monkeypatch: py
         assert (len(errors), n_asked) == known and len(errors) <= 2, "the background has nothing to do"
         live.scrub(1.0)
         assert live.wait("rest", timeout=60)
+
+
+def test_what_was_worked_out_ahead_is_what_is_shown(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another look at the stage would bring other objects for the same edits: their light would be found anew."""
+    stacks: dict[int, list[object]] = {}
+    set_stack = LiveRelighter.set_stack
+
+    def counted(relighter: LiveRelighter, stack: EditStack) -> None:
+        stacks.setdefault(id(relighter), []).append(stack)
+        set_stack(relighter, stack)
+
+    monkeypatch.setattr(LiveRelighter, "set_stack", counted)
+    with open_live(stage) as live:
+        live.wait("rest")
+        shown = list(stacks.values())
+    assert [len(given) for given in shown] == [1, 1], "of a coarse relighter and of one in full"
 
 
 def test_surfaces_are_shown_before_there_is_light(stage: Path) -> None:
