@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -54,3 +56,16 @@ def test_what_does_not_come_to_rest_is_left_out_and_said_so(monkeypatch: pytest.
     results = [{"case": {"name": "room"}, "result": size | {"changes": {"dab": found, "amount": done}}}]
     text = "\n".join(frames.markdown(results))
     assert "| dab | 60 | not at rest in 0 s |" in text and "all of 1 changes" in text
+
+
+def test_what_takes_too_long_is_broken_off() -> None:
+    before = signal.getsignal(signal.SIGALRM)
+    start = time.perf_counter()
+    with pytest.raises(frames.TooSlow), frames.at_most(0.05):
+        while time.perf_counter() < start + 30:
+            pass
+    assert time.perf_counter() < start + 10
+    with frames.at_most(0.0):
+        pass
+    assert signal.getsignal(signal.SIGALRM) is before
+    assert frames._cell({"broken_off_after": 240.0}) == "slower than 240 s"

@@ -7,10 +7,11 @@ and amount are measured before anything is at rest, too: the product with all th
 from __future__ import annotations
 
 import hashlib
+import signal
 import time
 from collections import Counter
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -45,6 +46,8 @@ DOME = "dome rotation"
 NOT_AT_REST = ", before rest"
 #: Longest that is waited for rest before a change is measured; what takes longer is left out, and the table says so.
 REST_SECONDS = 60.0
+#: Longest for one change with its preparation; after that the case ends, as what was broken off is in no known state.
+MOST_SECONDS = 240.0
 _LARGE = {"width": 1920, "height": 1080}
 #: A large image is measured for its frames, not for its build, which has fewer rays.
 _LARGE_RAYS = {"record_rays": 512, "rays_per_bounce_row": 32, "light_samples": 4, "dome_samples": 4}
@@ -62,6 +65,10 @@ def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
 
 class NotAtRest(Exception):
     """Nothing to be measured from: it takes too long to get there."""
+
+
+class TooSlow(Exception):
+    """A change was broken off."""
 
 
 @dataclass
@@ -121,7 +128,13 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     if not large:
         found["edits"] |= {"64 edits": kinds_of(scene.many), "64 mixed edits": kinds_of(scene.mixed)}
     for name, begin in changes.items():
-        found["changes"][name] = _measured(name, begin, quick)
+        try:
+            with at_most(0.0 if quick else MOST_SECONDS):
+                found["changes"][name] = _measured(name, begin, quick)
+        except TooSlow:
+            found["changes"][name] = {"broken_off_after": MOST_SECONDS, "same_bits": None}
+            print(f"  {name:<28} broken off after {MOST_SECONDS:.0f} s, and with it the rest of this case", flush=True)
+            break
         print(f"  {name:<28} {_cell(found['changes'][name])} frames/s", flush=True)
     return found
 
@@ -147,6 +160,25 @@ def _measured(name: str, begin: Callable[[], Callable[[int], Any]], quick: bool)
     return {"threads": times, "fps": 1 / times["2"]["median"], "same_bits": same_bits}
 
 
+@contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """Raise `TooSlow` in the block after so long, between kernels; 0 is never, and so it is where there is no alarm."""
+    if not seconds or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise TooSlow
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def make_scene(parts: Parts) -> Scene:
     """The changes need an area light, a dome and edits."""
     kinds = parts.snapshot.lights.kind
@@ -161,7 +193,7 @@ def _changes(scene: Scene, quick: bool) -> dict[str, Callable[[], Callable[[int]
     """By name: prepares, and returns what makes frame i.
 
     Every change starts from rest but the first two, and those of mixed edits and of a dome, which take minutes to come
-    to rest in a large scene; the dome is last.
+    to rest in a large scene. Mixed edits are last: where edits look at receivers, one image can take minutes.
     """
     live, lights = scene.parts.live, scene.parts.lights
     image = np.empty((scene.parts.view.height, scene.parts.view.width, 3), np.float32)
@@ -217,9 +249,9 @@ def _changes(scene: Scene, quick: bool) -> dict[str, Callable[[], Callable[[int]
         "play": prepared(scene.stack, play),
         "64 edits: amount": prepared(lambda: scene.many, many_amount),
         "64 edits: light move": prepared(lambda: scene.many, move),
+        DOME: prepared(scene.stack, turn, rests=quick),
         "64 mixed edits: amount": prepared(lambda: scene.mixed, many_amount, rests=quick),
         "64 mixed edits: light move": prepared(lambda: scene.mixed, move, rests=quick),
-        DOME: prepared(scene.stack, turn, rests=quick),
     }
 
 
@@ -331,6 +363,8 @@ def _played(one: dict[str, Any]) -> str:
 def _cell(change: dict[str, Any] | None) -> str:
     if change is None:
         return ""
+    if "broken_off_after" in change:
+        return f"slower than {change['broken_off_after']:.0f} s"
     if "not_at_rest_in" in change:
         return f"not at rest in {change['not_at_rest_in']:.0f} s"
     two, one = change["threads"]["2"], change["threads"]["1"]
