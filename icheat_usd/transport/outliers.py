@@ -20,6 +20,10 @@ _NOISE = 0.02  # squared relative error below which a light's noise does not cou
 #: where geometry gives no reason for an outlier.
 _CHANCE, _CHANCE_ON_SHEETS = 0.1, 0.5
 _ON_SHEET = 0.99  # of a sample comes from the corners of its block, which all lie on one surface with it
+_CREASE = 0.5  # pixels to a surface that rises from a sample's own
+#: Squared error in creases, as a share of the squared light there, beyond what the survey saw: a lamp so near that no
+#: light known resembles it shines on each of their pixels in another way.
+_IN_CREASES = 0.02
 _BLOCK = 16  # pixels over which noise is averaged
 
 
@@ -44,8 +48,9 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
     """Give records to the samples that add most to the error of the image under the training lights.
 
     Greedy, the greatest first, until the rest are expected to be below the
-    tolerance or there are ``settings.max_share`` records. Neighbours take part
-    in the new records where that at least halves their own error.
+    tolerance or there are ``settings.max_share`` records. More is expected in
+    creases than the survey saw there. Neighbours take part in the new records
+    where that at least halves their own error.
 
     Parameters
     ----------
@@ -65,8 +70,10 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
     scores = judge.scores(everything, table, mesh.record_view)
     most = int(settings.max_share * view.n)
     noise = judge.smoothed(scores.noise) * np.where(records.fit > _ON_SHEET, _CHANCE_ON_SHEETS, _CHANCE)
+    light = judge.scores(everything, SparseRows.empty(view.n, 1), np.zeros(1, np.int64)).sure
+    unseen = np.where(mesh.corners < _CREASE, _IN_CREASES * light, 0)
     for round_ in range(_ROUNDS):
-        excess = np.where(mesh.record < 0, np.maximum(scores.sure - noise, 0), 0)
+        excess = np.where(mesh.record < 0, np.maximum(scores.sure - noise, 0) + unseen, 0)
         order = np.lexsort((everything, -excess))
         rest = np.cumsum(excess[order][::-1])[::-1] / view.n
         worst = order[: int(np.searchsorted(-rest, -(settings.tolerance**2)))]

@@ -89,9 +89,9 @@ class Mesh:
             self._nearness = (np.sqrt(x * x + y * y + 1) / depth).astype(np.float32)
         self.first = np.full(shape, -1, np.int64)
         self.first.reshape(-1)[view.pixel[::-1]] = np.arange(view.n)[::-1]
-        self._corners = np.empty(view.n, np.float32)
+        self.corners = np.empty(view.n, np.float32)  #: pixels to the surface that rises nearest, at most 4
         kernels.corner_distance(
-            self.first, view.points.position, view.points.shading_normal, self.extent, view.pixel, self._corners
+            self.first, view.points.position, view.points.shading_normal, self.extent, view.pixel, self.corners
         )
         self.level = np.full(shape, coarsest.bit_length() - 1, np.int32)
         self.parent = self.level.copy()  #: before the last division
@@ -136,7 +136,7 @@ class Mesh:
             view.points.shading_normal,
             view.points.instance,
             self.extent,
-            self._corners,
+            self.corners,
             self._nearness,
             self.level,
             self.corner,

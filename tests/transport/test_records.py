@@ -326,6 +326,26 @@ def test_a_thin_bright_bar_gets_records_of_its_own() -> None:
     assert found.error == pytest.approx(error(found), rel=0.05, abs=1e-4)
 
 
+def test_creases_have_records_for_lights_that_nobody_knew() -> None:
+    scene = floor_scene(96, 72)
+    view = view_of(scene)
+    known = np.ones((view.n, 1), np.float32)
+    records = place(scene, known, view, coarsest=16)[-1]
+    survey = Survey(np.stack([known, known], axis=1), np.empty(0, np.int64), np.empty((0, 2, 1), np.float32))
+    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    found = add_outliers(records, survey, tint, RecordSettings(tolerance=0.001))
+    in_crease = np.flatnonzero(records.mesh.corners < 0.5)
+    new = found.view[len(records.view) :]
+    assert 20 < len(in_crease) < 0.05 * view.n and np.isin(new, in_crease).all()
+    # One that hangs in the crease, and meets what lies beside it in the image in another way.
+    light = np.exp(-2 * records.mesh.corners)[:, None] * (1.5 + np.sin(view.pixel[:, None] * 2.0)).astype(np.float32)
+
+    def squared(records: Records) -> float:
+        return float(np.sum((records.interpolation.matmul(light[records.view]) - light) ** 2))
+
+    assert squared(found) < 0.5 * squared(records)
+
+
 def test_outliers_leave_noise_alone_and_keep_to_the_share() -> None:
     scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
     view = view_of(scene)
