@@ -41,6 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lights", choices=sorted(SETS), default="first", help="errors: which test lights; second is for reports alone"
     )
+    parser.add_argument(
+        "--mixed", action="store_true", help="frames: also 64 edits of which some turn hues; takes minutes"
+    )
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--gather", type=int, help="gather samples; default the preview's own")
@@ -75,7 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
         suite = importlib.import_module(f"tools.benchmarking.{SUITES[name]}")
         results = []
         for case in suite.cases(stages, arguments.quick):
-            case = {"name": short_name(case["stage"]), "minutes": arguments.minutes, "lights": arguments.lights, **case}
+            options = {"minutes": arguments.minutes, "lights": arguments.lights, "mixed": arguments.mixed}
+            case = {"name": short_name(case["stage"]), **options, **case}
             print(f"{name}: {_described(case)}", flush=True)
             task = {"suite": name, "case": case, "effort": effort, "quick": arguments.quick}
             results.append(_run_case(task | {"folder": str(folder / "images")}))
@@ -101,7 +105,9 @@ def markdown(report: dict[str, Any]) -> str:
 
 
 def _described(case: dict[str, Any]) -> str:
-    extras = [f"{key} {value}" for key, value in case.items() if key not in ("name", "stage", "minutes", "lights")]
+    extras = [
+        f"{key} {value}" for key, value in case.items() if key not in ("name", "stage", "minutes", "lights", "mixed")
+    ]
     return ", ".join([case["name"], *extras])
 
 
