@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import parallel_kernel
@@ -15,33 +16,39 @@ def camera_rays(  # type: ignore[no-untyped-def]
     to_world,
     window,
     width,
-    first,
     height,
     orthographic,
     lens_radius,
     focus_distance,
+    pixels,
     n_samples,
+    first_sample,
+    centred,
     seed,
     origins,
     directions,
     axial,
+    stream,
 ):
-    """Rays of the pixels from `first` on, `n_samples` of each: unit directions, and the cosine to the camera's axis.
+    """Rays of `pixels`, `n_samples` of each: unit directions, and the cosine to the camera's axis.
 
-    One sample is the pixel's centre through the lens's centre; more are
-    stratified over the pixel's square and the lens's disk.
+    They are the samples from number `first_sample` on of a sequence that
+    stratifies the pixel's square and the lens's disk; where `centred`, all go
+    through the centre of both. `stream` gets a number of its own for each
+    sample of each pixel.
     """
     left, right, bottom, top = window
     for ray in prange(len(axial)):
-        pixel = first + ray // n_samples
-        k = ray % n_samples
+        pixel = pixels[ray // n_samples]
+        k = first_sample + ray % n_samples
+        stream[ray] = np.int32(hash_combine(hash_combine(0x63616D, pixel), k))
         px, py = pixel % width, pixel // width
         u, v, lens_x, lens_y = 0.5, 0.5, 0.0, 0.0
-        if n_samples > 1:
-            stream = hash_combine(seed, pixel)
-            u, v = sobol_pair(k, hash_combine(stream, 0))
+        if not centred:
+            scramble = hash_combine(seed, pixel)
+            u, v = sobol_pair(k, hash_combine(scramble, 0))
             if lens_radius > 0.0:
-                a, b = sobol_pair(k, hash_combine(stream, 1))
+                a, b = sobol_pair(k, hash_combine(scramble, 1))
                 radius = lens_radius * math.sqrt(a)
                 lens_x = radius * math.cos(2.0 * math.pi * b)
                 lens_y = radius * math.sin(2.0 * math.pi * b)

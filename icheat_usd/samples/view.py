@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.kernels.camera import camera_rays
-from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import environment_radiance
 from icheat_usd.materials import concatenate_points, dielectric_split, empty_points, shade_hits, take_points
 from icheat_usd.scene import F32, I32, I64, DeltaKind, LightKind, SceneSnapshot, SurfacePoints
@@ -43,7 +42,8 @@ class ViewSamples:
     to_eye: F32  #: (n, 3) unit, back along the last segment of the path
     depth: F32  #: (n,) length of the path from the eye, metres
     background: F32  #: (width * height, 3) radiance of the paths that left the scene, already weighted
-    sky: SkyPaths | None = None  #: these paths, for another sky
+    stream: I32  #: (n,) random counters: by pixel, number of the sample and turn at glass, whatever is traced with it
+    sky: SkyPaths  #: the paths that left the scene, for another sky
 
     @property
     def n(self) -> int:
@@ -59,6 +59,7 @@ class _Paths(NamedTuple):
     throughput: F32
     travelled: F32
     splits: I32  # how often this path was divided so far
+    stream: I32  # counter of its random numbers
 
     def take(self, rows: I64) -> _Paths:
         columns: tuple[Any, ...] = self
@@ -73,6 +74,7 @@ class _Found(NamedTuple):
     points: SurfacePoints
     to_eye: F32
     depth: F32
+    stream: I32
 
 
 def view_samples(
@@ -80,26 +82,32 @@ def view_samples(
     tracer: Tracer,
     *,
     samples_per_pixel: int = 1,
+    first_sample: int = 0,
+    centred: bool | None = None,
     seed: int = 0,
     max_splits: int = 2,
-    pixels: tuple[int, int] | None = None,
+    pixels: tuple[int, int] | I64 | None = None,
 ) -> ViewSamples:
     """Trace the camera's rays to the points that it sees.
 
     Mirrors and holes are followed. Smooth glass and translucent surfaces
     divide a path in two, so that both what they reflect and what shines
-    through have view samples.
+    through have view samples. What a pixel gets depends on no other pixel.
 
     Parameters
     ----------
     samples_per_pixel
-        1 looks through pixel centres and the centre of the lens; more are
-        stratified over the pixel (box filter) and the lens.
+        Stratified over the pixel (box filter) and the lens. The throughput of
+        a call's samples is shared among them; who adds calls up weights them anew.
+    first_sample
+        Number of the first one in each pixel's sequence: a second call goes on where the first one ended.
+    centred
+        Look through pixel centres and the centre of the lens instead; by default for a single sample.
     max_splits
         Divisions of one path; where more would follow, one continuation is chosen at random.
     pixels
         First pixel and the one behind the last, row-major, of a part of the
-        image; the whole image by default.
+        image, or an ascending list of pixels (n,) int64; the whole image by default.
 
     Raises
     ------
@@ -108,24 +116,25 @@ def view_samples(
     """
     if samples_per_pixel < 1:
         raise ValueError(f"a pixel needs at least one sample, not {samples_per_pixel}")
+    if centred is None:
+        centred = samples_per_pixel == 1 and first_sample == 0
     camera = snapshot.camera
     n_pixels = camera.width * camera.height
+    if not isinstance(pixels, np.ndarray):
+        pixels = np.arange(*(pixels or (0, n_pixels)), dtype=np.int64)
     escaped: list[SkyPaths] = []
     found: list[_Found] = []
     at_once = max(1, _RAYS_AT_ONCE // samples_per_pixel)
-    begin, end = (0, n_pixels) if pixels is None else pixels
-    for first in range(begin, end, at_once):
-        n = (min(first + at_once, end) - first) * samples_per_pixel
-        paths, limit = _camera_paths(snapshot, first, n, samples_per_pixel, seed)
-        found += _follow(
-            snapshot, tracer, paths, limit, int(hash_combine(seed & 0xFFFFFFFF, first)), max_splits, escaped
-        )
+    for begin in range(0, len(pixels), at_once):
+        some = np.ascontiguousarray(pixels[begin : begin + at_once], np.int64)
+        paths, limit = _camera_paths(snapshot, some, samples_per_pixel, first_sample, centred, seed)
+        found += _follow(snapshot, tracer, paths, limit, seed, max_splits, escaped)
     pixel = np.concatenate([np.empty(0, np.int32), *(part.pixel for part in found)])
     order = np.argsort(pixel, kind="stable")
     points = concatenate_points(empty_points(0), *(part.points for part in found))
 
-    def ordered(name: str, width: tuple[int, ...]) -> F32:
-        parts = [np.empty((0, *width), np.float32), *(getattr(part, name) for part in found)]
+    def ordered(name: str, width: tuple[int, ...], kind: type[np.generic] = np.float32) -> Any:
+        parts = [np.empty((0, *width), kind), *(getattr(part, name) for part in found)]
         return np.ascontiguousarray(np.concatenate(parts)[order])
 
     nothing = SkyPaths(np.empty(0, np.int32), np.empty((0, 3), np.float32), np.empty((0, 3), np.float32))
@@ -140,37 +149,44 @@ def view_samples(
         ordered("to_eye", (3,)),
         ordered("depth", ()),
         sky_behind(snapshot, sky, n_pixels),
+        ordered("stream", (), np.int32),
         sky,
     )
 
 
-def _camera_paths(snapshot: SceneSnapshot, first: int, n: int, spp: int, seed: int) -> tuple[_Paths, F32]:
-    """Paths of the pixels from `first` on, begun at the near plane, and the length to the far plane."""
+def _camera_paths(
+    snapshot: SceneSnapshot, pixels: I64, n_samples: int, first_sample: int, centred: bool, seed: int
+) -> tuple[_Paths, F32]:
+    """Paths of pixels, begun at the near plane, and the length to the far plane."""
     camera = snapshot.camera
+    n = len(pixels) * n_samples
     origin, direction = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-    axial = np.empty(n, np.float64)
+    axial, stream = np.empty(n, np.float64), np.empty(n, np.int32)
     camera_rays(
         np.ascontiguousarray(camera.to_world, np.float64),
         camera.window,
         camera.width,
-        first,
         camera.height,
         camera.orthographic,
         camera.lens_radius,
         max(camera.focus_distance, 1e-9),
-        spp,
+        pixels,
+        n_samples,
+        first_sample,
+        centred,
         seed & 0xFFFFFFFF,
         origin,
         direction,
         axial,
+        stream,
     )
     near = (camera.near / axial).astype(np.float32)
     limit = ((camera.far - camera.near) / axial).astype(np.float32)
     if camera.near > 0:
         origin += near[:, None] * direction
-    pixel = (first + np.arange(n) // spp).astype(np.int32)
-    throughput = np.full((n, 3), 1.0 / spp, np.float32)
-    return _Paths(pixel, origin, direction, throughput, near, np.zeros(n, np.int32)), limit
+    pixel = np.repeat(pixels.astype(np.int32), n_samples)
+    throughput = np.full((n, 3), 1.0 / n_samples, np.float32)
+    return _Paths(pixel, origin, direction, throughput, near, np.zeros(n, np.int32), stream), limit
 
 
 def _follow(
@@ -211,15 +227,17 @@ def _follow(
         travelled = paths.travelled + length
         splits = paths.splits + divides
         parts = []
-        for goes, direction, weight in (
-            (reflects & followed, split.reflected, split.weight_reflected),
-            (refracts & followed, split.refracted, split.weight_refracted),
+        for turn, goes, direction, weight in (
+            (1, reflects & followed, split.reflected, split.weight_reflected),
+            (2, refracts & followed, split.refracted, split.weight_refracted),
         ):
             rows = np.flatnonzero(goes)
             turned = np.ascontiguousarray(direction[rows])
             origin = spawn_points(snapshot, take_points(points, rows), turned)
             throughput = paths.throughput[rows] * weight[rows]
-            parts.append(_Paths(paths.pixel[rows], origin, turned, throughput, travelled[rows], splits[rows]))
+            # Each side of a division has random numbers of its own; a path that only turns keeps its counter.
+            stream = np.where(divides[rows], paths.stream[rows] * np.int32(3) + np.int32(turn), paths.stream[rows])
+            parts.append(_Paths(paths.pixel[rows], origin, turned, throughput, travelled[rows], splits[rows], stream))
         paths = _Paths(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     return found
 
@@ -229,7 +247,7 @@ def _follow_by_chance(
 ) -> list[_Found]:
     if not len(paths.pixel):
         return []
-    ends = first_surfaces(snapshot, tracer, paths.origin, paths.direction, seed)
+    ends = first_surfaces(snapshot, tracer, paths.origin, paths.direction, seed, counters=paths.stream)
     paths = paths._replace(direction=ends.direction, throughput=paths.throughput * ends.throughput)
     alive = paths.throughput.max(axis=1) > 0
     _escape(paths, np.flatnonzero(alive & (ends.points.instance < 0)), sky)
@@ -243,13 +261,15 @@ def _escape(paths: _Paths, rows: I64, sky: list[SkyPaths]) -> None:
 
 def sky_behind(snapshot: SceneSnapshot, paths: SkyPaths, n_pixels: int) -> F32:
     """Radiance of the domes along camera paths that leave the scene, (n_pixels, 3), weighted."""
-    background = np.zeros((n_pixels, 3), np.float64)
+    background = np.zeros((n_pixels, 3), np.float32)
     if len(paths.pixel) and np.any(snapshot.lights.kind == LightKind.DOME):
         radiance = environment_radiance(snapshot, np.ascontiguousarray(paths.direction))
         seen = paths.throughput.astype(np.float64) * radiance
+        # Only the stretch of the image that is traced is touched: a band costs the same in an image of any size.
+        first, end = int(paths.pixel.min()), int(paths.pixel.max()) + 1
         for channel in range(3):
-            background[:, channel] = np.bincount(paths.pixel, seen[:, channel], n_pixels)
-    return background.astype(np.float32)
+            background[first:end, channel] = np.bincount(paths.pixel - first, seen[:, channel], end - first)
+    return background
 
 
 def _end(paths: _Paths, points: SurfacePoints, length: F32, rows: I64, share: F32 | None) -> _Found:
@@ -262,4 +282,5 @@ def _end(paths: _Paths, points: SurfacePoints, length: F32, rows: I64, share: F3
         take_points(points, rows),
         -paths.direction[rows],
         paths.travelled[rows] + length[rows],
+        paths.stream[rows],
     )

@@ -47,9 +47,7 @@ class SeenLight:
             return
         own = self._own
         glow = self._glow(now)
-        background = own.background
-        if own.sky is not None:
-            background = sky_behind(now, own.sky, own.width * own.height)
+        background = sky_behind(now, own.sky, own.width * own.height)
         self.view = replace(own, background=background, points=own.points._replace(emission=glow))
         before = own.background + develop(own, own.points.emission)
         after = background + develop(own, glow)
