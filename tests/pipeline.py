@@ -10,7 +10,7 @@ import numpy as np
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import EMPTY_STACK, Edit, EditStack, Selection
-from icheat_usd.final_gather import FinalGather, GatherSettings, final_gather
+from icheat_usd.final_gather import NO_EXTRAS, Extras, FinalGather, GatherSettings, final_gather
 from icheat_usd.relight import Relighter, RelitView, build_relighter
 from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
 from icheat_usd.samples.develop import develop
@@ -97,7 +97,13 @@ class Pipeline:
         return develop(self.view, radiance).reshape(self.view.height, self.view.width, 3)
 
     def final(
-        self, *edits: Edit, samples: int = 4, rays: int = 256, light_samples: int = 16, seed: int = 0
+        self,
+        *edits: Edit,
+        samples: int = 4,
+        rays: int = 256,
+        light_samples: int = 16,
+        seed: int = 0,
+        extras: Extras = NO_EXTRAS,
     ) -> FinalGather:
         settings = GatherSettings(samples, rays, light_samples, self.n_bounces, seed)
         field = self.field(*edits)
@@ -109,6 +115,7 @@ class Pipeline:
             settings=settings,
             gather=self.gather if needs else None,
             gather_radiance=self.cell_light.radiance if needs else None,
+            extras=extras,
         )
 
 

@@ -44,6 +44,7 @@ class Gatherer:
     field: EditField
     solution: GatherSolution | None  #: None where no edit asks for it
     clear: tuple[Tracer, ...]  #: the scene without the occluders of each of `EditField.throughs`
+    prefixes: tuple[Gatherer, ...] = ()  #: the same for the first edits of the stack alone, if their light is wanted
 
 
 class GatheredLight(NamedTuple):
@@ -51,6 +52,7 @@ class GatheredLight(NamedTuple):
 
     base: F32  #: (n, 3) without edits
     edited: F32  #: (n, 3) with them
+    steps: tuple[F32, ...] = ()  #: (n, 3) with the first one, the first two, ... of them, for `Gatherer.prefixes`
 
 
 class _Lobe(NamedTuple):
@@ -78,7 +80,8 @@ def gathered_light(gatherer: Gatherer, points: SurfacePoints, to_eye: F32, strea
         white = np.ones((len(glossy), 3), np.float32)
         lobes.append(_lit(g, glossy, rays, white, int(hash_combine(own, 2))))
         base[glossy] += _mean(lobes[1].light.total, g.n_rays)
-    return GatheredLight(base, _edited(g, points, lobes, base))
+    steps = tuple(_edited(prefix, points, lobes, base) for prefix in g.prefixes)
+    return GatheredLight(base, _edited(g, points, lobes, base), steps)
 
 
 def _lit(gatherer: Gatherer, where: I64, rays: GatherRays, tint: F32, seed: int) -> _Lobe:

@@ -11,15 +11,27 @@ the noise of few rays is bent by a steep curve, so such edits want many rays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
+from icheat_usd.final_gather.extras import (
+    NO_EXTRAS,
+    Extras,
+    contribution_layers,
+    covered,
+    light_layers,
+    with_prefixes,
+)
 from icheat_usd.final_gather.gatherer import Gatherer, GatherSolution, gathered_light
 from icheat_usd.final_gather.hits import trace_hemisphere
+from icheat_usd.image.cryptomatte import Coverage, weighted_sum
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
 from icheat_usd.materials import concatenate_points, take_points
@@ -61,6 +73,21 @@ class FinalGather:
     albedo: F64
     normal: F64
     depth: F64
+    contributions: Mapping[str, F64] = field(default_factory=lambda: MappingProxyType({}))
+    #: what each edit adds to the edits before it, by path; if asked for
+    light_groups: Mapping[str, F64] = field(default_factory=lambda: MappingProxyType({}))
+    #: direct light of groups of lights, by name; if asked for
+    coverage: Mapping[str, Coverage] = field(default_factory=lambda: MappingProxyType({}))
+    #: which prims ("object") and edits ("edit") the pixels show; if asked for
+
+
+class _Band(NamedTuple):
+    """Layers of some of the pixels, (n_pixels, k) each."""
+
+    usual: dict[str, F64]
+    contributions: dict[str, F64]
+    light_groups: dict[str, F64]
+    coverage: dict[str, Coverage]
 
 
 def final_gather(
@@ -71,6 +98,7 @@ def final_gather(
     settings: GatherSettings,
     gather: GatherSamples | None = None,
     gather_radiance: F32 | None = None,
+    extras: Extras = NO_EXTRAS,
     progress: Progress = silent,
 ) -> FinalGather:
     """Render direct and indirect light, the latter with and without edits.
@@ -88,6 +116,8 @@ def final_gather(
         operations that depend on the colour of the light, whose ratio must not
         be formed from single noisy rays, by curves, and by offsets, which are
         integrated over area.
+    extras : Extras
+        What to compute beside the usual layers.
 
     Raises
     ------
@@ -108,9 +138,11 @@ def final_gather(
         _solution(field, gather, gather_radiance),
         tuple(build_tracer(snapshot, tracer.engine, hidden=field.edits[edit].occluders) for edit in field.throughs),
     )
+    if extras.contributions:
+        gatherer = with_prefixes(gatherer)
     n_pixels = snapshot.camera.width * snapshot.camera.height
     band = max(RAYS_AT_ONCE // (settings.samples_per_pixel * max(settings.gather_rays, 1)), 1)
-    bands: list[dict[str, F64]] = []
+    bands: list[_Band] = []
     for first in range(0, n_pixels, band):
         progress("gather", first / n_pixels)
         pixels = (first, min(first + band, n_pixels))
@@ -122,11 +154,20 @@ def final_gather(
             max_splits=0,
             pixels=pixels,
         )
-        bands.append(_band(gatherer, view, settings, pixels, int(hash_combine(settings.seed, first))))
+        bands.append(_band(gatherer, view, settings, pixels, int(hash_combine(settings.seed, first)), extras))
     progress("gather", 1.0)
     shape = (snapshot.camera.height, snapshot.camera.width, -1)
-    layers = {name: np.concatenate([part[name] for part in bands]).reshape(shape) for name in bands[0]}
-    return FinalGather(**layers)
+
+    def whole(parts: list[dict[str, F64]]) -> dict[str, F64]:
+        return {name: np.concatenate([part[name] for part in parts]).reshape(shape) for name in parts[0]}
+
+    mattes = [part.coverage for part in bands]
+    return FinalGather(
+        **whole([part.usual for part in bands]),
+        contributions=whole([part.contributions for part in bands]),
+        light_groups=whole([part.light_groups for part in bands]),
+        coverage={name: weighted_sum((1.0, part[name]) for part in mattes) for name in mattes[0]},
+    )
 
 
 def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> SurfacePoints:
@@ -156,10 +197,14 @@ def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | N
 
 
 def _band(
-    gatherer: Gatherer, view: ViewSamples, settings: GatherSettings, pixels: tuple[int, int], seed: int
-) -> dict[str, F64]:
-    """Layers of some of the pixels, (n_pixels, k) each."""
-    direct = reflected_direct(
+    gatherer: Gatherer,
+    view: ViewSamples,
+    settings: GatherSettings,
+    pixels: tuple[int, int],
+    seed: int,
+    extras: Extras,
+) -> _Band:
+    per_light = reflected_direct(
         gatherer.snapshot,
         gatherer.tracer,
         gatherer.sampler,
@@ -167,15 +212,21 @@ def _band(
         view.to_eye,
         seed,
         samples_per_light(gatherer.snapshot, settings.light_samples, settings.dome_samples),
-    ).sum(axis=0)
+    )
     light = gathered_light(gatherer, view.points, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
-    return {
+    usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),
-        "direct": develop(view, direct, pixels),
+        "direct": develop(view, per_light.sum(axis=0), pixels),
         "indirect": develop(view, light.base, pixels),
         "indirect_edited": develop(view, light.edited, pixels),
         "albedo": average(view, view.points.albedo, pixels),
         "normal": average(view, view.points.shading_normal, pixels),
         "depth": average(view, view.depth[:, None], pixels),
     }
+    return _Band(
+        usual,
+        contribution_layers(gatherer.field, light, view, pixels) if extras.contributions else {},
+        light_layers(extras, gatherer.snapshot, per_light, view, pixels),
+        covered(extras, gatherer.snapshot, gatherer.field, view, pixels),
+    )
