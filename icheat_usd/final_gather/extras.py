@@ -109,8 +109,7 @@ def _shares(view: ViewSamples, pixels: tuple[int, int]) -> F64:
     first, end = pixels
     weight = view.throughput.astype(np.float64).mean(axis=1)
     total = np.bincount(view.pixel - first, weight, end - first)
-    if view.sky is not None:
-        escaped = view.sky.throughput.astype(np.float64).mean(axis=1)
-        total += np.bincount(view.sky.pixel - first, escaped, end - first)
+    escaped = view.sky.throughput.astype(np.float64).mean(axis=1)
+    total += np.bincount(view.sky.pixel - first, escaped, end - first)
     place: I64 = view.pixel.astype(np.int64) - first
     return weight / np.where(total > 0, total, 1.0)[place]
