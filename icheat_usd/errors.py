@@ -23,5 +23,9 @@ class ImageError(IcheatError):
     """An image or colour configuration cannot be read or written."""
 
 
+class SettingsError(IcheatError):
+    """A choice of how to render is unknown or out of range."""
+
+
 class SampleSetMismatch(IcheatError):
     """Arrays that belong to different sample sets were combined."""

@@ -7,8 +7,18 @@ import math
 import numpy as np
 from numba import prange
 
-from icheat_usd.kernels._jit import parallel_kernel
+from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.random import hash_combine, sobol_pair
+
+
+@kernel
+def _place(filter_inverse: np.ndarray, share: float) -> float:
+    """Where the filter has this share of its weight on the left; an empty table is the box of one pixel."""
+    steps = len(filter_inverse) - 1
+    if steps < 1:
+        return share
+    at = min(int(share * steps), steps - 1)
+    return filter_inverse[at] + (share * steps - at) * (filter_inverse[at + 1] - filter_inverse[at])
 
 
 @parallel_kernel
@@ -24,6 +34,7 @@ def camera_rays(  # type: ignore[no-untyped-def]
     n_samples,
     first_sample,
     centred,
+    filter_inverse,
     seed,
     origins,
     directions,
@@ -33,8 +44,8 @@ def camera_rays(  # type: ignore[no-untyped-def]
     """Rays of `pixels`, `n_samples` of each: unit directions, and the cosine to the camera's axis.
 
     They are the samples from number `first_sample` on of a sequence that
-    stratifies the pixel's square and the lens's disk; where `centred`, all go
-    through the centre of both. `stream` gets a number of its own for each
+    stratifies the pixel filter and the lens's disk; where `centred`, all go
+    through the centre of both. `filter_inverse` is `PixelFilter.inverse`. `stream` gets a number of its own for each
     sample of each pixel.
     """
     left, right, bottom, top = window
@@ -47,6 +58,7 @@ def camera_rays(  # type: ignore[no-untyped-def]
         if not centred:
             scramble = hash_combine(seed, pixel)
             u, v = sobol_pair(k, hash_combine(scramble, 0))
+            u, v = _place(filter_inverse, np.float64(u)), _place(filter_inverse, np.float64(v))
             if lens_radius > 0.0:
                 a, b = sobol_pair(k, hash_combine(scramble, 1))
                 radius = lens_radius * math.sqrt(a)

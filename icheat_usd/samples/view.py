@@ -10,6 +10,7 @@ import numpy as np
 from icheat_usd.kernels.camera import camera_rays
 from icheat_usd.lighting import environment_radiance
 from icheat_usd.materials import concatenate_points, dielectric_split, empty_points, shade_hits, take_points
+from icheat_usd.samples.pixel_filter import BOX, PixelFilter
 from icheat_usd.scene import F32, I32, I64, DeltaKind, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
@@ -84,6 +85,7 @@ def view_samples(
     samples_per_pixel: int = 1,
     first_sample: int = 0,
     centred: bool | None = None,
+    pixel_filter: PixelFilter = BOX,
     seed: int = 0,
     max_splits: int = 2,
     pixels: tuple[int, int] | I64 | None = None,
@@ -97,12 +99,14 @@ def view_samples(
     Parameters
     ----------
     samples_per_pixel
-        Stratified over the pixel (box filter) and the lens. The throughput of
+        Stratified over the pixel filter and the lens. The throughput of
         a call's samples is shared among them; who adds calls up weights them anew.
     first_sample
         Number of the first one in each pixel's sequence: a second call goes on where the first one ended.
     centred
         Look through pixel centres and the centre of the lens instead; by default for a single sample.
+    pixel_filter
+        How far around its centre a pixel looks; all samples count the same.
     max_splits
         Divisions of one path; where more would follow, one continuation is chosen at random.
     pixels
@@ -127,7 +131,7 @@ def view_samples(
     at_once = max(1, _RAYS_AT_ONCE // samples_per_pixel)
     for begin in range(0, len(pixels), at_once):
         some = np.ascontiguousarray(pixels[begin : begin + at_once], np.int64)
-        paths, limit = _camera_paths(snapshot, some, samples_per_pixel, first_sample, centred, seed)
+        paths, limit = _camera_paths(snapshot, some, samples_per_pixel, first_sample, centred, pixel_filter, seed)
         found += _follow(snapshot, tracer, paths, limit, seed, max_splits, escaped)
     pixel = np.concatenate([np.empty(0, np.int32), *(part.pixel for part in found)])
     order = np.argsort(pixel, kind="stable")
@@ -155,7 +159,13 @@ def view_samples(
 
 
 def _camera_paths(
-    snapshot: SceneSnapshot, pixels: I64, n_samples: int, first_sample: int, centred: bool, seed: int
+    snapshot: SceneSnapshot,
+    pixels: I64,
+    n_samples: int,
+    first_sample: int,
+    centred: bool,
+    pixel_filter: PixelFilter,
+    seed: int,
 ) -> tuple[_Paths, F32]:
     """Paths of pixels, begun at the near plane, and the length to the far plane."""
     camera = snapshot.camera
@@ -174,6 +184,7 @@ def _camera_paths(
         n_samples,
         first_sample,
         centred,
+        pixel_filter.inverse,
         seed & 0xFFFFFFFF,
         origin,
         direction,
