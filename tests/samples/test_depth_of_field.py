@@ -25,6 +25,7 @@ def stage_with_an_edge(unit: float, distance: float) -> Usd.Stage:
     camera.CreateVerticalApertureAttr(0.002 / (0.1 * unit))
     camera.CreateFStopAttr(F_STOP)
     camera.CreateFocusDistanceAttr(FOCUS / unit)
+    camera.CreateClippingRangeAttr((0.1 / unit, 100.0 / unit))
     wall = UsdGeom.Mesh.Define(stage, "/wall")
     far = 50.0 / unit
     z = -distance / unit
