@@ -105,7 +105,7 @@ class Pipeline:
         seed: int = 0,
         extras: Extras = NO_EXTRAS,
     ) -> FinalGather:
-        settings = GatherSettings(samples, rays, light_samples, self.n_bounces, seed)
+        settings = GatherSettings(samples, rays, light_samples, self.n_bounces, seed, method="brute")
         field = self.field(*edits)
         needs = field.uses_incident or field.has_offset
         return final_gather(

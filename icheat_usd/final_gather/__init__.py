@@ -1,6 +1,8 @@
 """The final gather: the frame that ships, with edits evaluated where rays really land."""
 
 from icheat_usd.final_gather.extras import NO_EXTRAS, Extras
-from icheat_usd.final_gather.integrator import FinalGather, GatherSettings, final_gather
+from icheat_usd.final_gather.integrator import FinalGather, final_gather
+from icheat_usd.final_gather.irradiance_cache import CacheSettings
+from icheat_usd.final_gather.settings import GatherSettings
 
-__all__ = ["NO_EXTRAS", "Extras", "FinalGather", "GatherSettings", "final_gather"]
+__all__ = ["CacheSettings", "NO_EXTRAS", "Extras", "FinalGather", "GatherSettings", "final_gather"]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.edits.bound import Ends
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import OffsetCasters
 from icheat_usd.edits.pairs import PairLight, edited_light
@@ -45,6 +46,7 @@ class Gatherer:
     solution: GatherSolution | None  #: None where no edit asks for it
     clear: tuple[Tracer, ...]  #: the scene without the occluders of each of `EditField.throughs`
     prefixes: tuple[Gatherer, ...] = ()  #: the same for the first edits of the stack alone, if their light is wanted
+    follows_paths: bool = True  #: light at the ends of gather rays is found by paths; else it is that of `solution`
 
 
 class GatheredLight(NamedTuple):
@@ -55,7 +57,7 @@ class GatheredLight(NamedTuple):
     steps: tuple[F32, ...] = ()  #: (n, 3) with the first one, the first two, ... of them, for `Gatherer.prefixes`
 
 
-class _Lobe(NamedTuple):
+class Lobe(NamedTuple):
     """Rays of one lobe of some of the points, and the light that they bring."""
 
     where: I64  #: (m,) points that have the lobe
@@ -64,31 +66,70 @@ class _Lobe(NamedTuple):
     tint: F32  #: (m, 3) reflectance outside the rays' throughput
     seed: int
 
+    @property
+    def n_rays(self) -> int:
+        return len(self.rays.throughput) // max(len(self.where), 1)
+
+    def mean(self) -> F32:
+        """Radiance that the points reflect by this lobe, (m, 3)."""
+        total = self.light.total.reshape(-1, self.n_rays, 3).sum(axis=1, dtype=np.float64)
+        return self.tint * (total.astype(np.float32) / np.float32(self.n_rays))
+
 
 def gathered_light(gatherer: Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
     """Gather at each point; points that no edit touches have the same bits in both results."""
     g = gatherer
     everywhere = np.arange(len(stream), dtype=np.int64)
-    rays = trace_hemisphere(g.snapshot, g.tracer, points, stream, g.n_rays, seed)
-    lobes = [_lit(g, everywhere, rays, points.albedo, seed)]
-    base = points.albedo * _mean(lobes[0].light.total, g.n_rays)
+    lobes = [diffuse_lobe(g, points, everywhere, stream, seed)]
+    base = lobes[0].mean()
+    shiny = specular_lobe(g, points, to_eye, stream, g.n_rays, seed)
+    if shiny is not None:
+        lobes.append(shiny)
+        base[shiny.where] += shiny.mean()
+    steps = tuple(_under_stack(prefix, points, lobes, base) for prefix in g.prefixes)
+    return GatheredLight(base, _under_stack(g, points, lobes, base), steps)
+
+
+def _under_stack(gatherer: Gatherer, points: SurfacePoints, lobes: list[Lobe], base: F32) -> F32:
+    edited = base.copy()
+    receivers, touched = touched_receivers(gatherer.field, points)
+    if len(touched):
+        light = light_of_pairs(gatherer, receivers, touched, lobes, points.albedo)
+        edited[touched] = gatherer.field.finish(light, receivers)
+    return edited
+
+
+def diffuse_lobe(gatherer: Gatherer, points: SurfacePoints, where: I64, stream: I64, seed: int) -> Lobe:
+    """Rays about the normals of points `where`."""
+    g = gatherer
+    some = take_points(points, where)
+    rays = trace_hemisphere(g.snapshot, g.tracer, some, stream[where], g.n_rays, seed)
+    return _lit(g, where, rays, some.albedo, seed)
+
+
+def specular_lobe(
+    gatherer: Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, n_rays: int, seed: int
+) -> Lobe | None:
+    """Rays of the specular lobe of those points that have one."""
+    g = gatherer
     glossy = np.flatnonzero(is_glossy(points))
-    if len(glossy):
-        own = int(hash_combine(seed, 7))
-        shiny = take_points(points, glossy)
-        rays = trace_specular(g.snapshot, g.tracer, shiny, to_eye[glossy], stream[glossy], g.n_rays, own)
-        white = np.ones((len(glossy), 3), np.float32)
-        lobes.append(_lit(g, glossy, rays, white, int(hash_combine(own, 2))))
-        base[glossy] += _mean(lobes[1].light.total, g.n_rays)
-    steps = tuple(_edited(prefix, points, lobes, base) for prefix in g.prefixes)
-    return GatheredLight(base, _edited(g, points, lobes, base), steps)
+    if len(glossy) == 0:
+        return None
+    own = int(hash_combine(seed, 7))
+    shiny = take_points(points, glossy)
+    rays = trace_specular(g.snapshot, g.tracer, shiny, to_eye[glossy], stream[glossy], n_rays, own)
+    return _lit(g, glossy, rays, np.ones((len(glossy), 3), np.float32), int(hash_combine(own, 2)))
 
 
-def _lit(gatherer: Gatherer, where: I64, rays: GatherRays, tint: F32, seed: int) -> _Lobe:
-    return _Lobe(where, rays, _reflected(gatherer, rays.ends, rays.throughput, int(hash_combine(seed, 11))), tint, seed)
+def _lit(gatherer: Gatherer, where: I64, rays: GatherRays, tint: F32, seed: int) -> Lobe:
+    return Lobe(where, rays, _reflected(gatherer, rays.ends, rays.throughput, int(hash_combine(seed, 11))), tint, seed)
 
 
 def _reflected(gatherer: Gatherer, points: SurfacePoints, throughput: F32, seed: int) -> Reflected:
+    if not gatherer.follows_paths:
+        assert gatherer.solution is not None
+        by_group = gatherer.solution.at(points) * throughput
+        return Reflected(by_group.sum(axis=0), by_group)
     return reflected_radiance(
         gatherer.snapshot,
         gatherer.tracer,
@@ -102,18 +143,28 @@ def _reflected(gatherer: Gatherer, points: SurfacePoints, throughput: F32, seed:
     )
 
 
-def _edited(gatherer: Gatherer, points: SurfacePoints, lobes: list[_Lobe], base: F32) -> F32:
-    edited = base.copy()
-    everyone = gatherer.field.receivers(points)
+def touched_receivers(field: EditField, points: SurfacePoints) -> tuple[Ends, I64]:
+    """The points that an edit may change, as receivers, and which they are."""
+    everyone = field.receivers(points)
     touched = np.flatnonzero((everyone.masks > 0).any(axis=0))
-    if len(touched) == 0:
-        return edited
-    position = np.full(len(base), -1, np.int64)
+    return everyone.take(touched), touched
+
+
+def light_of_pairs(
+    gatherer: Gatherer, receivers: Ends, touched: I64, lobes: list[Lobe], albedo: F32, *, with_offsets: bool = True
+) -> F32:
+    """Light of the lobes' rays under the stack, before `EditField.finish`.
+
+    Parameters
+    ----------
+    receivers : Ends of the m points `touched`
+    albedo : (n, 3) of all points
+    """
+    position = np.full(len(albedo), -1, np.int64)
     position[touched] = np.arange(len(touched))
-    receivers = everyone.take(touched)
     blocks = []
     for lobe in lobes:
-        owner = position[np.repeat(lobe.where, gatherer.n_rays)]
+        owner = position[np.repeat(lobe.where, lobe.n_rays)]
         some = np.flatnonzero((owner >= 0) & lobe.rays.throughput.any(axis=1))
         if len(some) == 0:
             continue
@@ -125,15 +176,13 @@ def _edited(gatherer: Gatherer, points: SurfacePoints, lobes: list[_Lobe], base:
             held = some[reached[owner[some]] & hidden[lobe.rays.ends.instance[some]]]
             if len(held):
                 blocks.append(_held_back(gatherer, lobe, held, owner[held], slot))
-    offsets = None if gatherer.solution is None else gatherer.solution.offsets
-    light = edited_light(gatherer.field, receivers, blocks, offsets, points.albedo[touched])
-    edited[touched] = gatherer.field.finish(light, receivers)
-    return edited
+    offsets = None if gatherer.solution is None or not with_offsets else gatherer.solution.offsets
+    return edited_light(gatherer.field, receivers, blocks, offsets, albedo[touched])
 
 
 def _pairs(
     gatherer: Gatherer,
-    lobe: _Lobe,
+    lobe: Lobe,
     some: I64,
     owner: I64,
     casters: SurfacePoints,
@@ -144,11 +193,11 @@ def _pairs(
     """Rays `some` of a lobe as pairs with the casters that they end on."""
     field = gatherer.field
     seen = np.zeros_like(brought) if gatherer.solution is None else gatherer.solution.at(casters)
-    tint = np.take(lobe.tint, some // gatherer.n_rays, axis=0) / np.float32(gatherer.n_rays)
+    tint = np.take(lobe.tint, some // lobe.n_rays, axis=0) / np.float32(lobe.n_rays)
     return PairLight(owner, field.casters(casters), seen, tint * brought, tint * throughput, through)
 
 
-def _held_back(gatherer: Gatherer, lobe: _Lobe, held: I64, owner: I64, slot: int) -> PairLight:
+def _held_back(gatherer: Gatherer, lobe: Lobe, held: I64, owner: I64, slot: int) -> PairLight:
     """What rays that end on an occluder would have brought from behind it."""
     rays = lobe.rays
     # The same random numbers take a ray the same way up to the occluder; the light behind draws from a stream of its
@@ -166,7 +215,3 @@ def _held_back(gatherer: Gatherer, lobe: _Lobe, held: I64, owner: I64, slot: int
         throughput = rays.reflectance[held] * throughput
     light = _reflected(gatherer, behind.points, throughput, int(hash_combine(lobe.seed, 100 + slot)))
     return _pairs(gatherer, lobe, held, owner, behind.points, light.by_group, throughput, slot)
-
-
-def _mean(values: F32, n_rays: int) -> F32:
-    return values.reshape(-1, n_rays, 3).sum(axis=1, dtype=np.float64).astype(np.float32) / np.float32(n_rays)

@@ -1,7 +1,7 @@
-"""Brute-force final gathering: every camera sample shoots its own gather rays.
+"""Final gathering: diffuse light from an irradiance cache, or by brute force from every camera sample.
 
-The plain version: no cache, no photon map, no denoiser. Slow and unbiased,
-apart from the limits below; what is faster is measured against it.
+The brute-force way has no cache and takes earlier bounces from paths. Slow and
+unbiased, apart from the limits below; what is faster is measured against it.
 
 Limits: all reflections before the last are diffuse; caustics through glass are
 left out of the lighting, as shadow rays pass straight through it. What curves
@@ -11,8 +11,9 @@ the noise of few rays is bent by a steep curve, so such edits want many rays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ import numpy as np
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
+from icheat_usd.final_gather.cached import CachedGather
+from icheat_usd.final_gather.camera_pass import CameraPass
 from icheat_usd.final_gather.extras import (
     NO_EXTRAS,
     Extras,
@@ -29,8 +32,11 @@ from icheat_usd.final_gather.extras import (
     light_layers,
     with_prefixes,
 )
-from icheat_usd.final_gather.gatherer import Gatherer, GatherSolution, gathered_light
+from icheat_usd.final_gather.gatherer import GatheredLight, Gatherer, GatherSolution, gathered_light
 from icheat_usd.final_gather.hits import trace_hemisphere
+from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Places, overture
+from icheat_usd.final_gather.record_rays import HemisphereTracer
+from icheat_usd.final_gather.settings import GatherSettings
 from icheat_usd.image.cryptomatte import Coverage, weighted_sum
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
@@ -38,27 +44,21 @@ from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
 from icheat_usd.samples.develop import average, develop
-from icheat_usd.scene import F32, F64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, I64, Camera, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import sum_groups
 
 #: Gather rays in flight; bounds memory and keeps a chunk's arrays near the caches.
 RAYS_AT_ONCE = 1 << 19
 
+#: Camera samples that are shaded together, where light is cached.
+SAMPLES_AT_ONCE = 1 << 17
+
+#: What the indirect light of camera samples is found by: their places, directions to the eye, numbers, and a seed.
+FindLight = Callable[[Places, F32, I64, int], GatheredLight]
+
 #: Where pilot points are taken from in the picture, at most.
 PILOT_ROWS, PILOT_COLUMNS = 24, 128
-
-
-@dataclass(frozen=True)
-class GatherSettings:
-    """Effort of a final gather."""
-
-    samples_per_pixel: int = 4
-    gather_rays: int = 64  #: per camera sample
-    light_samples: int = 4  #: shadow rays per light and camera sample, for direct light
-    n_bounces: int = 16  #: diffuse reflections before the last one
-    seed: int = 0
-    dome_samples: int | None = None  #: `light_samples` of domes; 4 times those of other lights by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +124,11 @@ def final_gather(
     EditError
         The stack needs the gather-sample solution and it was not given.
     """
-    if (field.uses_incident or field.has_offset) and (gather is None or gather_radiance is None):
-        raise EditError("the edit stack needs the gather-sample solution: pass gather and gather_radiance")
+    is_cached = settings.method == "cached"
+    if (is_cached or field.uses_incident or field.has_offset) and (gather is None or gather_radiance is None):
+        raise EditError(
+            "the cached method and this edit stack need the gather-sample solution: pass gather and gather_radiance"
+        )
     progress("gather", 0.0)
     sampler = build_light_sampler(snapshot, tracer, _pilot_points(snapshot, tracer, settings.seed), settings.seed)
     gatherer = Gatherer(
@@ -137,24 +140,21 @@ def final_gather(
         field,
         _solution(field, gather, gather_radiance),
         tuple(build_tracer(snapshot, tracer.engine, hidden=field.edits[edit].occluders) for edit in field.throughs),
+        follows_paths=not is_cached,
     )
     if extras.contributions:
         gatherer = with_prefixes(gatherer)
-    n_pixels = snapshot.camera.width * snapshot.camera.height
-    band = max(RAYS_AT_ONCE // (settings.samples_per_pixel * max(settings.gather_rays, 1)), 1)
+    band = SAMPLES_AT_ONCE if is_cached else max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
+    n_edge = settings.edge_samples if is_cached else 0
+    camera = CameraPass(snapshot, tracer, settings.samples_per_pixel, n_edge, settings.seed, band)
+    find: FindLight = partial(_followed, gatherer)
+    if is_cached and gather is not None:
+        find = _cached(gatherer, gather, camera, settings, progress).light
     bands: list[_Band] = []
-    for first in range(0, n_pixels, band):
-        progress("gather", first / n_pixels)
-        pixels = (first, min(first + band, n_pixels))
-        view = view_samples(
-            snapshot,
-            tracer,
-            samples_per_pixel=settings.samples_per_pixel,
-            seed=settings.seed,
-            max_splits=0,
-            pixels=pixels,
-        )
-        bands.append(_band(gatherer, view, settings, pixels, int(hash_combine(settings.seed, first)), extras))
+    for number, (pixels, view) in enumerate(camera.all()):
+        progress("gather", number / len(camera.bands))
+        own_seed = int(hash_combine(settings.seed, pixels[0]))
+        bands.append(_band(gatherer, find, view, settings, pixels, own_seed, extras))
     progress("gather", 1.0)
     shape = (snapshot.camera.height, snapshot.camera.width, -1)
 
@@ -168,6 +168,34 @@ def final_gather(
         light_groups=whole([part.light_groups for part in bands]),
         coverage={name: weighted_sum((1.0, part[name]) for part in mattes) for name in mattes[0]},
     )
+
+
+def _cached(
+    gatherer: Gatherer, gather: GatherSamples, camera: CameraPass, settings: GatherSettings, progress: Progress
+) -> CachedGather:
+    """Place all records, by the camera samples that every pixel has."""
+    assert gatherer.solution is not None
+    snapshot = gatherer.snapshot
+    cells = np.concatenate([gatherer.solution.b.sum(axis=0), np.zeros((1, 3), np.float32)])
+    n_theta, n_phi, seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(settings.seed, 0xCAC4E))
+    tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, seed)
+    cache = IrradianceCache(tracer, cells, settings.cache, is_kept=not gatherer.field.is_identity)
+    views = [band.view for band in camera.first()]
+    points = concatenate_points(*(view.points for view in views))
+    pixel = np.concatenate([view.pixel for view in views])
+    extent = np.concatenate([_extent(snapshot.camera, view) for view in views])
+    overture(cache, Places(points, extent), pixel, snapshot.camera.width, progress)
+    return CachedGather(gatherer, cache, settings.glossy_rays)
+
+
+def _extent(camera: Camera, view: ViewSamples) -> F32:
+    """(n,) metres that a pixel spans at each view sample, across the line of sight."""
+    width = np.float32((camera.window[1] - camera.window[0]) / camera.width)
+    return np.full(view.n, width, np.float32) if camera.orthographic else view.depth * width
+
+
+def _followed(gatherer: Gatherer, places: Places, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
+    return gathered_light(gatherer, places.points, to_eye, stream, seed)
 
 
 def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> SurfacePoints:
@@ -198,6 +226,7 @@ def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | N
 
 def _band(
     gatherer: Gatherer,
+    find: FindLight,
     view: ViewSamples,
     settings: GatherSettings,
     pixels: tuple[int, int],
@@ -213,7 +242,8 @@ def _band(
         seed,
         samples_per_light(gatherer.snapshot, settings.light_samples, settings.dome_samples),
     )
-    light = gathered_light(gatherer, view.points, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
+    places = Places(view.points, _extent(gatherer.snapshot.camera, view))
+    light = find(places, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
     usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),

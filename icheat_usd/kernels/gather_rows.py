@@ -145,7 +145,7 @@ def _order_by_direction(n, x, y, z, bin_of, bin_begin, order):  # type: ignore[n
 
 
 @kernel
-def _trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at):  # type: ignore[no-untyped-def]
+def trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at):  # type: ignore[no-untyped-def]
     """Nearest hits of a packet, one by one where packets are slower."""
     if trace.packets:
         call_packet(trace.function, valid_at, trace.scene, rays_at, trace.arguments)
@@ -286,7 +286,7 @@ def count_hits(  # type: ignore[no-untyped-def]
                     words[10, :] = 0
                     words[11, :] = 0
                     words[17:21, :] = _INVALID
-                    _trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
+                    trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
                     # In steps over the packet, so that the loads of one ray do not wait for those of another.
                     for k in range(width):
                         if words[18, k] != _INVALID:

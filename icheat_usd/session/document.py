@@ -187,7 +187,7 @@ class Session(ShotParts):
         stack = self.stack
         field = bind(stack, self.snapshot)
         gather, radiance = None, None
-        if field.uses_incident or field.has_offset:
+        if settings.method == "cached" or field.uses_incident or field.has_offset:
             gather, radiance = self.gather, self.cell_light.radiance
         result = final_gather(
             self.snapshot,

@@ -1,0 +1,121 @@
+"""Indirect light of camera samples from an irradiance cache: diffuse interpolated, glossy gathered, edits mixed in."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from icheat_usd.edits.offsets import offset_radiance
+from icheat_usd.final_gather.edited_records import MOST_SOFT, EditedRecords, soft_masks
+from icheat_usd.final_gather.gatherer import (
+    GatheredLight,
+    Gatherer,
+    Lobe,
+    diffuse_lobe,
+    light_of_pairs,
+    specular_lobe,
+    touched_receivers,
+)
+from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, Places
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.materials import take_points
+from icheat_usd.scene import F32, I64, SurfacePoints
+
+_INVERSE_PI = np.float32(1.0 / np.pi)
+
+
+class CachedGather:
+    """A cache that no more records are added to, and what reads it.
+
+    Parameters
+    ----------
+    cache : IrradianceCache
+        With rays, if the stack has edits.
+    glossy_rays : int
+        Per point with a specular lobe.
+    """
+
+    def __init__(self, gatherer: Gatherer, cache: IrradianceCache, glossy_rays: int) -> None:
+        self._gatherer, self._cache, self._glossy_rays = gatherer, cache, glossy_rays
+        stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
+        self._stacks = [(stack, EditedRecords(stack, cache)) for stack in stacks]
+
+    def light(self, places: Places, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
+        """Radiance towards the eye; points that no edit touches have the same bits in both results."""
+        points = places.points
+        position, normal = points.position, points.shading_normal
+        found = self._cache.find(position, normal)
+        irradiance = np.maximum(self._cache.interpolate(found, position, normal), np.float32(0))
+        # What the coarser look at the scene has missed, less than a pixel wide, is gathered where it is.
+        alone = np.flatnonzero(found.number == 0)
+        if len(alone):
+            rays = self._cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone])
+            irradiance[alone] = np.pi * rays.radiance(self._cache.cells).mean(axis=1)
+        base = (points.albedo * (irradiance * _INVERSE_PI)).astype(np.float32, copy=False)
+        shiny = specular_lobe(self._gatherer, points, to_eye, stream, self._glossy_rays, seed)
+        if shiny is not None:
+            base[shiny.where] += shiny.mean()
+        if not self._stacks:
+            return GatheredLight(base, base.copy())
+        sample = _Sampled(points, stream, seed, found, base, shiny)
+        *steps, edited = (_under_stack(stack, records, sample) for stack, records in self._stacks)
+        return GatheredLight(base, edited, tuple(steps))
+
+
+class _Sampled(NamedTuple):
+    """Camera samples and their light before any edit."""
+
+    points: SurfacePoints
+    stream: I64
+    seed: int
+    found: Lookup
+    base: F32
+    shiny: Lobe | None
+
+
+def _under_stack(g: Gatherer, records: EditedRecords, sampled: _Sampled) -> F32:
+    points, base, shiny = sampled.points, sampled.base, sampled.shiny
+    edited = base.copy()
+    receivers, touched = touched_receivers(g.field, points)
+    if len(touched) == 0:
+        return edited
+    # Curves, light from behind occluders, and mixtures of too many soft masks look at pairs of their own; the
+    # cache corrects what their few rays brought.
+    by_pairs = (soft_masks(receivers.masks) > MOST_SOFT) | (sampled.found.number[touched] == 0)
+    if g.field.aggregates or g.field.throughs:
+        by_pairs[:] = True
+    lobes = [] if shiny is None else [shiny]
+    light = np.empty((len(touched), 3), np.float32)
+    which = touched[by_pairs]
+    if len(which):
+        own = diffuse_lobe(g, points, which, sampled.stream, int(hash_combine(sampled.seed, 23)))
+        brought = _brought(len(base), [own, *lobes])
+        some = receivers.take(np.flatnonzero(by_pairs))
+        light[by_pairs] = light_of_pairs(g, some, which, [own, *lobes], points.albedo)
+        light[by_pairs] += base[which] - brought[which]
+    rest = np.flatnonzero(~by_pairs)
+    if len(rest):
+        where, some = touched[rest], receivers.take(rest)
+        found = sampled.found.take(where)
+        change = records.change(found, points.position[where], points.shading_normal[where], some.masks)
+        light[rest] = base[where] + points.albedo[where] * (change * _INVERSE_PI)
+        if shiny is not None:
+            reflected = light_of_pairs(g, some, where, lobes, points.albedo, with_offsets=False)
+            light[rest] += reflected - _brought(len(base), lobes)[where]
+        if g.solution is not None and g.solution.offsets is not None:
+            light[rest] += offset_radiance(g.field, g.solution.offsets, some, points.albedo[where])
+    edited[touched] = g.field.finish(light, receivers)
+    return edited
+
+
+def _brought(n: int, lobes: list[Lobe]) -> F32:
+    """Light of lobes before any edit, (n, 3)."""
+    total = np.zeros((n, 3), np.float32)
+    for lobe in lobes:
+        total[lobe.where] += lobe.mean()
+    return total
+
+
+#: Added to the numbers of camera samples, so that their rays are none of a record's.
+_ALONE = np.int64(1 << 40)

@@ -1,0 +1,119 @@
+"""Camera samples of an image, band by band: some for every pixel, more where the picture has edges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from icheat_usd.materials import concatenate_points, take_points
+from icheat_usd.samples import ViewSamples, view_samples
+from icheat_usd.samples.adaptive import edge_pixels, join_looks, look_over
+from icheat_usd.samples.view import SkyPaths
+from icheat_usd.scene import I64, SceneSnapshot
+from icheat_usd.tracing import Tracer
+
+#: Camera samples that are kept from the first pass for the second, of all bands; 200 bytes each.
+_KEPT = 2_000_000
+
+
+class Band(NamedTuple):
+    """A part of the image."""
+
+    pixels: tuple[int, int]  #: the first and the one behind the last, row-major
+    view: ViewSamples
+
+
+class CameraPass:
+    """Camera samples of a view; the same ones every time they are asked for.
+
+    Parameters
+    ----------
+    band : int
+        Samples per band, about.
+    """
+
+    def __init__(self, snapshot: SceneSnapshot, tracer: Tracer, n: int, n_edge: int, seed: int, band: int) -> None:
+        self._snapshot, self._tracer = snapshot, tracer
+        self._n, self._n_edge, self._seed = n, n_edge, seed
+        camera = snapshot.camera
+        n_pixels = camera.width * camera.height
+        pixels = max(1, band // n)
+        self.bands = [(first, min(first + pixels, n_pixels)) for first in range(0, n_pixels, pixels)]
+        self._kept: dict[int, ViewSamples] = {}
+        self._edges: I64 = np.empty(0, np.int64)
+        self._is_kept = n_pixels * n <= _KEPT
+
+    def first(self) -> Iterator[Band]:
+        """Samples that every pixel has; finds the edges on the way."""
+        looks = []
+        for number, pixels in enumerate(self.bands):
+            view = self._trace(pixels, self._n, 0)
+            if self._is_kept:
+                self._kept[number] = view
+            if self._n_edge:
+                looks.append(look_over(view, self._snapshot.camera, pixels))
+            yield Band(pixels, view)
+        if looks:
+            self._edges = edge_pixels(join_looks(*looks), self._snapshot.camera.width)
+
+    def all(self) -> Iterator[Band]:
+        """All samples, after `first` has been gone through."""
+        for number, pixels in enumerate(self.bands):
+            view = self._kept.pop(number, None)
+            if view is None:
+                view = self._trace(pixels, self._n, 0)
+            begin, end = np.searchsorted(self._edges, pixels)
+            edges = self._edges[begin:end]
+            if len(edges):
+                view = _joined(view, self._trace(edges, self._n_edge, self._n), edges)
+            yield Band(pixels, view)
+
+    def _trace(self, pixels: tuple[int, int] | I64, n: int, first: int) -> ViewSamples:
+        return view_samples(
+            self._snapshot,
+            self._tracer,
+            samples_per_pixel=n,
+            first_sample=first,
+            centred=False if self._n + self._n_edge > 1 else None,
+            seed=self._seed,
+            max_splits=0,
+            pixels=pixels,
+        )
+
+
+def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> ViewSamples:
+    """Samples of both; in `pixels`, which `more` has, each counts as much as any other."""
+    n, m = view.samples_per_pixel, more.samples_per_pixel
+    has_more = np.zeros(view.width * view.height, bool)
+    has_more[pixels] = True
+    share, rest = np.float32(n / (n + m)), np.float32(m / (n + m))
+    scale = np.where(has_more, share, np.float32(1))
+    pixel = np.concatenate([view.pixel, more.pixel])
+    order = np.argsort(pixel, kind="stable")
+    throughput = np.concatenate([view.throughput * scale[view.pixel, None], more.throughput * rest])
+
+    def both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.concatenate([a, b])[order])
+
+    assert view.sky is not None
+    assert more.sky is not None
+    sky = SkyPaths(
+        np.concatenate([view.sky.pixel, more.sky.pixel]),
+        np.concatenate([view.sky.throughput * scale[view.sky.pixel, None], more.sky.throughput * rest]),
+        np.concatenate([view.sky.direction, more.sky.direction]),
+    )
+    background = view.background * scale[:, None]
+    background[pixels] += more.background[pixels] * rest
+    return replace(
+        view,
+        pixel=pixel[order],
+        throughput=np.ascontiguousarray(throughput[order]),
+        points=take_points(concatenate_points(view.points, more.points), order),
+        to_eye=both(view.to_eye, more.to_eye),
+        depth=both(view.depth, more.depth),
+        background=background,
+        sky=sky,
+    )

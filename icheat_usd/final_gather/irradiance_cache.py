@@ -1,0 +1,296 @@
+"""An irradiance cache: records placed coarse to fine before anything is shown, then read by every camera sample.
+
+Ward, Rubinstein, Clear 1988, A Ray Tracing Solution for Diffuse Interreflection; gradients, reach and neighbour
+clamping as in `kernels.irradiance_cache`. Records do not depend on edits, nor on threads: a round finds the places
+that no record reaches, traces all of them at once, and adds them in their order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from icheat_usd.final_gather.record_rays import HemisphereTracer, RecordRays, concatenate_rays
+from icheat_usd.kernels import irradiance_cache as kernels
+from icheat_usd.materials import concatenate_points, take_points
+from icheat_usd.progress import Progress, silent
+from icheat_usd.scene import F32, I32, I64, SurfacePoints
+
+_COARSEST = 32  # pixels between the first places that are looked at
+_RAYS_AT_ONCE = 1 << 19
+_CREASE = 0.05  # pixels from the next surface, below which a record counts for little, so that better ones are made
+_LEAST_TRUST = 1e-3
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """How densely records are placed, and how well each is measured.
+
+    Raises
+    ------
+    ValueError
+        A value makes no sense.
+    """
+
+    n_theta: int = 16  #: rings of a record's hemisphere; 3 times as many sectors
+    accuracy: float = 0.35  #: reach of a record, in harmonic mean distances of the surfaces around
+    least_reach: float = 1.0  #: pixels
+    most_reach: float = 24.0  #: pixels
+    most_turn: float = 20.0  #: degrees between normals
+    tolerance: float = 0.1  #: relative error of a record's own prediction at another, from which it ends before that
+    coverage: float = 0.3  #: sum of weights at a place, 1 at a record itself, from which it needs no record of its own
+
+    def __post_init__(self) -> None:
+        if self.n_theta < 4 or self.n_theta % 4:
+            raise ValueError(f"n_theta is a multiple of 4, not {self.n_theta}")
+        if not 0 < self.least_reach <= self.most_reach:
+            raise ValueError(f"least_reach {self.least_reach} must be positive and at most most_reach")
+
+    @property
+    def n_phi(self) -> int:
+        return 3 * self.n_theta
+
+
+class Lookup(NamedTuple):
+    """Records of m places."""
+
+    number: I32  #: (m,) how many there are
+    record: I32  #: (m, MAX_ENTRIES)
+    weight: F32  #: (m, MAX_ENTRIES) add up to 1
+    coverage: F32  #: (m,)
+
+    def take(self, which: I64) -> Lookup:
+        """Those of some places."""
+        return Lookup(self.number[which], self.record[which], self.weight[which], self.coverage[which])
+
+
+class RecordValues(NamedTuple):
+    """Irradiance of records in C channels, and how it changes."""
+
+    irradiance: F32  #: (n, C)
+    by_turn: F32  #: (n, C, 3)
+    by_move: F32  #: (n, C, 3) per metre
+
+
+class Places(NamedTuple):
+    """Where irradiance is wanted."""
+
+    points: SurfacePoints  #: (m,)
+    extent: F32  #: (m,) metres that a pixel spans there
+
+
+@dataclass(eq=False)
+class IrradianceCache:
+    """Records, and the light of each.
+
+    Parameters
+    ----------
+    cells : (n_cells + 1, C) float32
+        Radiance that gather cells send; the last row is zero.
+    """
+
+    tracer: HemisphereTracer
+    cells: F32
+    settings: CacheSettings
+    is_kept: bool = False  #: whether rays are kept, so that edits can look at them
+    table: kernels.RecordTable = field(init=False)
+    values: RecordValues = field(init=False)
+    _points: list[SurfacePoints] = field(default_factory=list)
+    _rays: list[RecordRays] = field(default_factory=list)
+    _least: F32 = field(init=False)
+    _index: kernels.RecordHash | None = None
+
+    def __post_init__(self) -> None:
+        n = self.cells.shape[1]
+        none = np.empty((0, 3), np.float32)
+        self.table = kernels.RecordTable(none, none.copy(), *(np.empty(0, np.float32) for _ in range(3)))
+        gradients = np.empty((0, n, 3), np.float32)
+        self.values = RecordValues(np.empty((0, n), np.float32), gradients, gradients.copy())
+        self._least = np.empty(0, np.float32)
+
+    @property
+    def n(self) -> int:
+        return len(self.table.reach)
+
+    @property
+    def rays(self) -> RecordRays:
+        """Rays of all records.
+
+        Raises
+        ------
+        ValueError
+            They were not kept.
+        """
+        if not self._rays:
+            raise ValueError("the cache has no rays: make it with is_kept=True")
+        if len(self._rays) > 1:
+            self._rays = [concatenate_rays(self._rays)]
+        return self._rays[0]
+
+    @property
+    def points(self) -> SurfacePoints:
+        """Where the records are; kept as rays are."""
+        if len(self._points) > 1:
+            self._points = [concatenate_points(*self._points)]
+        return self._points[0]
+
+    def find(self, position: F32, normal: F32) -> Lookup:
+        """Records that reach some places."""
+        m = len(position)
+        found = Lookup(
+            np.zeros(m, np.int32),
+            np.zeros((m, kernels.MAX_ENTRIES), np.int32),
+            np.zeros((m, kernels.MAX_ENTRIES), np.float32),
+            np.zeros(m, np.float32),
+        )
+        if self.n:
+            kernels.find_records(self.table, self._hash(), position, normal, *found)
+        return found
+
+    def interpolate(
+        self, found: Lookup, position: F32, normal: F32, values: RecordValues | None = None, slot: I32 | None = None
+    ) -> F32:
+        """Irradiance at places, (m, C); of other values than the unedited ones where `values` and `slot` are given."""
+        values = self.values if values is None else values
+        out = np.empty((len(position), values.irradiance.shape[1]), np.float32)
+        slot = np.arange(self.n, dtype=np.int32) if slot is None else slot
+        kernels.interpolate(self.table.position, self.table.normal, *values, slot, position, normal, *found[:3], out)
+        return out
+
+    def sums(self, rays: RecordRays, radiance: F32) -> tuple[RecordValues, F32]:
+        """Irradiance and gradients when rays bring `radiance` (n, n_rays, C), and the spread of distances."""
+        n, _, channels = radiance.shape
+        values = RecordValues(
+            np.empty((n, channels), np.float32),
+            np.empty((n, channels, 3), np.float32),
+            np.empty((n, channels, 3), np.float32),
+        )
+        spread = np.empty((n, 2), np.float32)
+        kernels.record_sums(
+            radiance,
+            rays.distance,
+            rays.shading_normal,
+            rays.stream,
+            rays.seed,
+            rays.n_theta,
+            rays.n_phi,
+            *values,
+            spread,
+        )
+        return values, spread
+
+    def add(self, places: Places) -> None:
+        """New records at all of these places."""
+        at_once = max(1, _RAYS_AT_ONCE // (self.settings.n_theta * self.settings.n_phi))
+        first = self.n
+        tables, values = [], []
+        for begin in range(0, len(places.extent), at_once):
+            some = np.arange(begin, min(begin + at_once, len(places.extent)))
+            points = take_points(places.points, some)
+            rays = self.tracer.trace(points, first + some)
+            found, spread = self.sums(rays, rays.radiance(self.cells))
+            tables.append(self._reaches(points, places.extent[some], found, spread))
+            values.append(found)
+            if self.is_kept:
+                self._rays.append(rays)
+                self._points.append(points)
+        self._judge(places, RecordValues(*(np.concatenate(column) for column in zip(*values, strict=True))))
+        parts = [self.table, *(table for table, _ in tables)]
+        self.table = kernels.RecordTable(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        self._least = np.concatenate([self._least, *(least for _, least in tables)])
+        clamped = np.empty(self.n - first, np.float32)
+        kernels.clamp_to_neighbours(self.table.position, self.table.reach, first, clamped)
+        self.table.reach[first:] = np.maximum(clamped, self._least[first:])
+        self.values = RecordValues(
+            *(np.concatenate([old, *new]) for old, new in zip(self.values, zip(*values, strict=True), strict=True))
+        )
+        self._index = None
+
+    def _reaches(
+        self, points: SurfacePoints, extent: F32, values: RecordValues, spread: F32
+    ) -> tuple[kernels.RecordTable, F32]:
+        settings = self.settings
+        least = settings.least_reach * extent
+        reach = np.minimum(settings.accuracy * spread[:, 0], spread[:, 1])
+        # Where light changes faster than surfaces tell.
+        change = np.sqrt((values.by_move.astype(np.float64) ** 2).sum(axis=(1, 2)))
+        size = np.sqrt((values.irradiance.astype(np.float64) ** 2).sum(axis=1))
+        limit = np.divide(size, change, out=np.full(len(size), np.inf), where=change > 0)
+        wide = np.minimum(reach, 0.5 * limit)
+        wide = np.clip(wide, least, settings.most_reach * extent).astype(np.float32)
+        # A gradient that holds for `reach` says nothing further out.
+        shrink = np.minimum(1.0, np.maximum(reach, 1e-30) / wide).astype(np.float32)
+        values.by_move[...] *= shrink[:, None, None]
+        turn = np.full(len(extent), 1.0 - np.cos(np.radians(settings.most_turn)), np.float32)
+        trust = np.clip(spread[:, 1] / (_CREASE * extent), _LEAST_TRUST, 1.0).astype(np.float32)
+        table = kernels.RecordTable(
+            np.ascontiguousarray(points.position), np.ascontiguousarray(points.shading_normal), wide, turn, trust
+        )
+        return table, least.astype(np.float32)
+
+    def _judge(self, places: Places, fresh: RecordValues) -> None:
+        """Old records end before new ones that they predict badly."""
+        if self.n == 0:
+            return
+        found = self.find(places.points.position, places.points.shading_normal)
+        joined = RecordValues(*(np.concatenate(pair) for pair in zip(self.values, fresh, strict=True)))
+        place = [np.concatenate([self.table.position, places.points.position])]
+        place.append(np.concatenate([self.table.normal, places.points.shading_normal]))
+        table = self.table._replace(position=place[0], normal=place[1])
+        wrong = np.zeros((len(found.number), kernels.MAX_ENTRIES), np.float32)
+        floor = 0.02 * float(self.values.irradiance.sum(axis=1).mean())
+        kernels.differences(table, *joined, self.n, found.number, found.record, floor, wrong)
+        new, entry = np.nonzero(wrong > self.settings.tolerance)
+        old = found.record[new, entry]
+        distance = np.linalg.norm(places.points.position[new] - self.table.position[old], axis=1).astype(np.float32)
+        np.minimum.at(self.table.reach, old, np.maximum(distance, self._least[old]))
+
+    def _hash(self) -> kernels.RecordHash:
+        if self._index is None:
+            reach = self.table.reach
+            level = np.ceil(np.log2(np.maximum(2.0 * reach.astype(np.float64), 1e-12))).astype(np.int64)
+            key, record = np.empty(8 * self.n, np.int64), np.empty(8 * self.n, np.int32)
+            n = kernels.list_keys(self.table.position, reach, level, key, record)
+            order = np.argsort(key[:n], kind="stable")
+            size = 1 << int(np.ceil(np.log2(2 * n + 1)))
+            table = np.full(size, -1, np.int64)
+            begin, end = np.zeros(size, np.int32), np.zeros(size, np.int32)
+            kernels.fill_hash(key[order], table, begin, end)
+            self._index = kernels.RecordHash(np.unique(level), table, begin, end, record[order])
+        return self._index
+
+
+def overture(cache: IrradianceCache, places: Places, pixel: I32, width: int, progress: Progress = silent) -> None:
+    """Place records so that all places are covered: on a grid of pixels, then ever finer ones between.
+
+    Parameters
+    ----------
+    places : of m view samples
+    pixel : (m,)
+        Their pixels, row-major in an image `width` wide.
+    """
+    x, y = pixel % width, pixel // width
+    waiting = np.ones(len(pixel), bool)
+    step = _COARSEST
+    rounds = [(step, 0)]
+    while step > 1:
+        rounds += [(step, step // 2), (step // 2, 0)]
+        step //= 2
+    for number, (step, shift) in enumerate(rounds):
+        progress("place records", number / len(rounds))
+        due = np.flatnonzero(waiting & (x % step == shift) & (y % step == shift))
+        waiting[due] = False
+        fill(cache, places, due)
+    progress("place records", 1.0)
+
+
+def fill(cache: IrradianceCache, places: Places, due: I64) -> None:
+    """Records for those of some places that are not covered."""
+    if len(due) == 0:
+        return
+    found = cache.find(np.take(places.points.position, due, axis=0), np.take(places.points.shading_normal, due, axis=0))
+    new = due[found.coverage < cache.settings.coverage]
+    if len(new):
+        cache.add(Places(take_points(places.points, new), places.extent[new]))

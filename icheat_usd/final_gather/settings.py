@@ -1,0 +1,39 @@
+"""How much work goes into a final gather."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from icheat_usd.final_gather.irradiance_cache import CacheSettings
+
+METHODS = ("cached", "brute")
+
+
+@dataclass(frozen=True)
+class GatherSettings:
+    """Effort of a final gather.
+
+    Raises
+    ------
+    ValueError
+        A value makes no sense.
+    """
+
+    samples_per_pixel: int = 4
+    gather_rays: int = 64  #: per camera sample and lobe that has no cache
+    light_samples: int = 4  #: shadow rays per light and camera sample, for direct light
+    n_bounces: int = 16  #: diffuse reflections before the last one
+    seed: int = 0
+    dome_samples: int | None = None  #: `light_samples` of domes; 4 times those of other lights by default
+    #: "cached" interpolates irradiance between records and takes earlier bounces from the gather samples; "brute"
+    #: follows paths from every camera sample: slow, unbiased, what all else is measured against.
+    method: str = "cached"
+    edge_samples: int = 12  #: more camera samples in pixels that hold edges of the picture
+    glossy_rays: int = 16  #: per camera sample of a glossy surface, where diffuse light is cached
+    cache: CacheSettings = field(default_factory=CacheSettings)
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"method '{self.method}' is none of {', '.join(METHODS)}")
+        if self.samples_per_pixel < 1 or self.edge_samples < 0:
+            raise ValueError("samples_per_pixel is at least 1, and edge_samples at least 0")

@@ -1,0 +1,385 @@
+"""Records of irradiance: their gradients and reach, a hash of the space that they reach, and interpolation.
+
+Ward and Heckbert 1992, Irradiance Gradients; Krivanek, Bouatouch, Pattanaik, Zara 2006, Making Radiance and
+Irradiance Caching Practical: Adaptive Caching and Neighbor Clamping.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.record_rays import turn_of
+from icheat_usd.kernels.samples import basis
+
+MAX_ENTRIES = 12  # records of one point; the lightest beyond them are left out
+#: Rays lower than this above the tangent plane, as a share of the cosine distribution, do not tell how near
+#: the nearest surface is: a bevelled floor would be one.
+_HIGH = 0.97
+_TOUCHING = np.float32(1e-6)  # metres: a ray may end where it starts, in a crease
+#: Height of a place over the plane of a record, as a share of its reach, from which it lies on another sheet.
+_STEP = np.float32(0.25)
+_EMPTY = np.int64(-1)
+
+
+class RecordTable(NamedTuple):
+    """Records in the order in which they were made."""
+
+    position: NDArray[np.float32]  #: (n, 3)
+    normal: NDArray[np.float32]  #: (n, 3) shading normal, unit
+    reach: NDArray[np.float32]  #: (n,) metres
+    turn: NDArray[np.float32]  #: (n,) turn of the normal, as ``1 - cos``, at which a record ends
+    trust: NDArray[np.float32]  #: (n,) 1, or less in a crease, where rays may start behind the next wall
+
+
+class RecordHash(NamedTuple):
+    """Which records reach into each cell of grids of many sizes."""
+
+    level: NDArray[np.int64]  #: sizes in use, log2 of metres
+    key: NDArray[np.int64]  #: (size,) -1 is empty; size is a power of two
+    begin: NDArray[np.int32]  #: (size + 1,) see `record`; list of slot s is ``begin[s]:end[s]``
+    end: NDArray[np.int32]
+    record: NDArray[np.int32]
+
+
+@parallel_kernel
+def record_sums(  # type: ignore[no-untyped-def]
+    radiance, distance, shading_normal, stream, seed, n_theta, n_phi, irradiance, by_turn, by_move, spread
+):
+    """Irradiance and its gradients from stratified hemispheres (`record_rays.trace_hemispheres`).
+
+    Ward and Heckbert 1992, equations 3 and 4, with the signs and weights that finite differences confirm.
+
+    Parameters
+    ----------
+    radiance : (n, n_rays, C) float32
+    distance : (n, n_rays) float32
+    irradiance : (n, C) float32, out
+    by_turn, by_move : (n, C, 3) float32, out
+        Change with ``normal x other normal``, and with place, metres, both in world space.
+    spread : (n, 2) float32, out
+        Harmonic mean of the distances, and the least of them but for grazing rays; metres, inf if there is nothing.
+    """
+    for r in prange(len(stream)):
+        _sums_of_record(
+            r,
+            radiance,
+            distance,
+            shading_normal,
+            turn_of(hash_combine(seed, stream[r])),
+            n_theta,
+            n_phi,
+            irradiance,
+            by_turn,
+            by_move,
+            spread,
+        )
+
+
+@kernel
+def _sums_of_record(  # type: ignore[no-untyped-def]
+    r, radiance, distance, shading_normal, first_turn, n_theta, n_phi, irradiance, by_turn, by_move, spread
+):
+    n_channels = radiance.shape[2]
+    nx, ny, nz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
+    tx, ty, tz, bx, by, bz = basis(nx, ny, nz)
+    m, n = n_theta, n_phi
+    closeness, nearest = 0.0, np.inf
+    for j in range(m):
+        for k in range(n):
+            d = distance[r, j * n + k]
+            closeness += 1.0 / max(d, np.float32(1e-30))
+            if (j + 0.5) / m < _HIGH:
+                nearest = min(nearest, d)
+    spread[r, 0] = m * n / closeness if closeness > 0.0 else np.inf
+    spread[r, 1] = nearest
+    for c in range(n_channels):
+        total = 0.0
+        turn_a, turn_b, move_a, move_b = 0.0, 0.0, 0.0, 0.0
+        for k in range(n):
+            phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
+            edge = 2.0 * np.pi * (k / n + first_turn)
+            before = k - 1 if k > 0 else n - 1
+            by_tangent, outwards, around = 0.0, 0.0, 0.0
+            for j in range(m):
+                value = radiance[r, j * n + k, c]
+                total += value
+                u = (j + 0.5) / m
+                by_tangent += np.sqrt(u / (1.0 - u)) * value
+                d = distance[r, j * n + k]
+                if j > 0:
+                    nearer = max(min(d, distance[r, (j - 1) * n + k]), _TOUCHING)
+                    low = j / m
+                    outwards += (1.0 - low) * np.sqrt(low) / nearer * (value - radiance[r, (j - 1) * n + k, c])
+                nearer = max(min(d, distance[r, j * n + before]), _TOUCHING)
+                width = np.sqrt((j + 1) / m) - np.sqrt(j / m)
+                around += width / nearer * (value - radiance[r, j * n + before, c])
+            turn_a -= np.sin(phi) * by_tangent
+            turn_b += np.cos(phi) * by_tangent
+            move_a += np.cos(phi) * outwards * (2.0 * np.pi / n) - np.sin(edge) * around
+            move_b += np.sin(phi) * outwards * (2.0 * np.pi / n) + np.cos(edge) * around
+        share = np.pi / (m * n)
+        irradiance[r, c] = share * total
+        by_turn[r, c, 0] = share * (turn_a * tx + turn_b * bx)
+        by_turn[r, c, 1] = share * (turn_a * ty + turn_b * by)
+        by_turn[r, c, 2] = share * (turn_a * tz + turn_b * bz)
+        by_move[r, c, 0] = move_a * tx + move_b * bx
+        by_move[r, c, 1] = move_a * ty + move_b * by
+        by_move[r, c, 2] = move_a * tz + move_b * bz
+
+
+@parallel_kernel
+def clamp_to_neighbours(position, reach, first, out):  # type: ignore[no-untyped-def]
+    """Reach of records from `first` on, no more than that of any other and the distance to it (Krivanek 2006, 4.2).
+
+    `out` is (n - first,) float32. What is near one record is near another beside it.
+    """
+    for i in prange(first, len(reach)):
+        least = reach[i]
+        for j in range(len(reach)):
+            if reach[j] < least:
+                x = position[j, 0] - position[i, 0]
+                y = position[j, 1] - position[i, 1]
+                z = position[j, 2] - position[i, 2]
+                d2 = x * x + y * y + z * z
+                left = least - reach[j]
+                if d2 < left * left:
+                    least = reach[j] + np.float32(np.sqrt(d2))
+        out[i - first] = least
+
+
+@kernel
+def cell_key(level, x, y, z):  # type: ignore[no-untyped-def]
+    """Cell of a place in the grid of one size. Far cells may share a key, which costs time only."""
+    size = 2.0**level
+    i, j, k = np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
+    mask = np.int64((1 << 18) - 1)
+    return ((np.int64(level) + 64) << 54) | ((i & mask) << 36) | ((j & mask) << 18) | (k & mask)
+
+
+@kernel
+def _slot_of(key, table):  # type: ignore[no-untyped-def]
+    """Slot of a key, or the empty one where it would be."""
+    mask = np.int64(len(table) - 1)
+    word = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    slot = np.int64(word >> np.uint64(20)) & mask
+    while table[slot] != _EMPTY and table[slot] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@kernel
+def list_keys(position, reach, level, key, record):  # type: ignore[no-untyped-def]
+    """Keys of the cells that each record reaches into, up to 8; returns how many there are."""
+    total = 0
+    for r in range(len(reach)):
+        size = 2.0 ** level[r]
+        first = np.empty(3, np.int64)
+        last = np.empty(3, np.int64)
+        for c in range(3):
+            first[c] = np.int64(np.floor((position[r, c] - reach[r]) / size))
+            last[c] = np.int64(np.floor((position[r, c] + reach[r]) / size))
+        for i in range(first[0], last[0] + 1):
+            for j in range(first[1], last[1] + 1):
+                for k in range(first[2], last[2] + 1):
+                    key[total] = cell_key(level[r], (i + 0.5) * size, (j + 0.5) * size, (k + 0.5) * size)
+                    record[total] = r
+                    total += 1
+    return total
+
+
+@kernel
+def fill_hash(keys, table, begin, end):  # type: ignore[no-untyped-def]
+    """Enter ascending `keys`, equal ones as one list."""
+    n = len(keys)
+    e = 0
+    while e < n:
+        last = e + 1
+        while last < n and keys[last] == keys[e]:
+            last += 1
+        slot = _slot_of(keys[e], table)
+        table[slot] = keys[e]
+        begin[slot] = e
+        end[slot] = last
+        e = last
+
+
+@kernel
+def _weight(position, normal, reach, turn, trust, r, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Weight of a record at a place, 0 to 1; it ends smoothly where the record does."""
+    dx, dy, dz = x - position[r, 0], y - position[r, 1], z - position[r, 2]
+    d2 = dx * dx + dy * dy + dz * dz
+    if d2 >= reach[r] * reach[r]:
+        return np.float32(0.0)
+    mx, my, mz = normal[r, 0], normal[r, 1], normal[r, 2]
+    turned = np.float32(1.0) - (nx * mx + ny * my + nz * mz)
+    if turned >= turn[r]:
+        return np.float32(0.0)
+    height = np.float32(0.5) * (dx * (nx + mx) + dy * (ny + my) + dz * (nz + mz))
+    if abs(height) > _STEP * reach[r]:
+        return np.float32(0.0)
+    # Turns count from the noise of float32 normals on.
+    error = np.float32(np.sqrt(d2)) / reach[r] + np.float32(np.sqrt(max(turned, np.float32(0.0)) / turn[r]))
+    if error >= np.float32(1.0):
+        return np.float32(0.0)
+    left = np.float32(1.0) - error
+    return trust[r] * left * left
+
+
+@parallel_kernel
+def find_records(table, index, position, normal, count, record, weight, coverage):  # type: ignore[no-untyped-def]
+    """Records that reach each of m places, and weights that add up to 1.
+
+    Parameters
+    ----------
+    table, index : RecordTable, RecordHash
+    position, normal : (m, 3) float32
+        World space; shading normals.
+    count : (m,) int32, record : (m, MAX_ENTRIES) int32, weight : (m, MAX_ENTRIES) float32, out
+    coverage : (m,) float32, out
+        Sum of the weights before.
+    """
+    for p in prange(len(position)):
+        _find_at(
+            p,
+            table.position,
+            table.normal,
+            table.reach,
+            table.turn,
+            table.trust,
+            index.level,
+            index.key,
+            index.begin,
+            index.end,
+            index.record,
+            position,
+            normal,
+            count,
+            record,
+            weight,
+            coverage,
+        )
+
+
+@kernel
+def _find_at(  # type: ignore[no-untyped-def]
+    p,
+    at,
+    facing,
+    reach,
+    turn,
+    trust,
+    levels,
+    keys,
+    begin,
+    end,
+    listed,
+    position,
+    normal,
+    count,
+    record,
+    weight,
+    coverage,
+):
+    x, y, z = position[p, 0], position[p, 1], position[p, 2]
+    nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
+    n = 0
+    total = np.float32(0.0)
+    for q in range(len(levels)):
+        slot = _slot_of(cell_key(levels[q], x, y, z), keys)
+        if keys[slot] == _EMPTY:
+            continue
+        for e in range(begin[slot], end[slot]):
+            r = listed[e]
+            w = _weight(at, facing, reach, turn, trust, r, x, y, z, nx, ny, nz)
+            if not w > np.float32(0.0):
+                continue
+            total += w
+            if n < MAX_ENTRIES:
+                record[p, n], weight[p, n] = r, w
+                n += 1
+                continue
+            least = 0
+            for k in range(1, n):
+                if weight[p, k] < weight[p, least]:
+                    least = k
+            if w > weight[p, least]:
+                record[p, least], weight[p, least] = r, w
+    count[p] = n
+    coverage[p] = total
+    kept = np.float32(0.0)
+    for k in range(n):
+        kept += weight[p, k]
+    for k in range(n):
+        weight[p, k] /= kept
+
+
+@parallel_kernel
+def interpolate(  # type: ignore[no-untyped-def]
+    at, facing, irradiance, by_turn, by_move, slot, position, normal, count, record, weight, out
+):
+    """Irradiance at m places from the records of `find_records`, with both gradients; not clamped.
+
+    Parameters
+    ----------
+    at, facing : (n, 3) float32
+        Of the records.
+    irradiance : (s, C), by_turn, by_move : (s, C, 3) float32
+    slot : (n,) int32
+        Row of each record in these.
+    out : (m, C) float32
+    """
+    for p in prange(len(position)):
+        for c in range(out.shape[1]):
+            out[p, c] = np.float32(0.0)
+        for k in range(count[p]):
+            r = record[p, k]
+            s = slot[r]
+            w = weight[p, k]
+            dx, dy, dz = position[p, 0] - at[r, 0], position[p, 1] - at[r, 1], position[p, 2] - at[r, 2]
+            mx, my, mz = facing[r, 0], facing[r, 1], facing[r, 2]
+            nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
+            tx, ty, tz = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
+            for c in range(out.shape[1]):
+                value = irradiance[s, c]
+                value += tx * by_turn[s, c, 0] + ty * by_turn[s, c, 1] + tz * by_turn[s, c, 2]
+                value += dx * by_move[s, c, 0] + dy * by_move[s, c, 1] + dz * by_move[s, c, 2]
+                out[p, c] += w * value
+
+
+@parallel_kernel
+def differences(  # type: ignore[no-untyped-def]
+    table, irradiance, by_turn, by_move, first, count, record, floor, out
+):
+    """How wrong each record near a new one was there: relative error of its own prediction, all channels together.
+
+    Parameters
+    ----------
+    first : int
+        The new records are ``first:``; `count`, `record` are what `find_records` found of the old ones at them.
+    floor : float
+        Irradiance below which errors do not show.
+    out : (n_new, MAX_ENTRIES) float32
+    """
+    at, facing = table.position, table.normal
+    for q in prange(len(count)):
+        i = first + q
+        for k in range(count[q]):
+            r = record[q, k]
+            dx, dy, dz = at[i, 0] - at[r, 0], at[i, 1] - at[r, 1], at[i, 2] - at[r, 2]
+            mx, my, mz = facing[r, 0], facing[r, 1], facing[r, 2]
+            nx, ny, nz = facing[i, 0], facing[i, 1], facing[i, 2]
+            tx, ty, tz = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
+            wrong, true = np.float32(0.0), np.float32(0.0)
+            for c in range(irradiance.shape[1]):
+                value = irradiance[r, c]
+                value += tx * by_turn[r, c, 0] + ty * by_turn[r, c, 1] + tz * by_turn[r, c, 2]
+                value += dx * by_move[r, c, 0] + dy * by_move[r, c, 1] + dz * by_move[r, c, 2]
+                wrong += abs(value - irradiance[i, c])
+                true += irradiance[i, c]
+            out[q, k] = wrong / max(true, np.float32(floor))

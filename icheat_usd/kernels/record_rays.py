@@ -1,0 +1,232 @@
+"""Stratified hemispheres of gather rays, each traced to the gather cell that it ends in."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.cell_map import (
+    WALK,
+    entry_at,
+    nearest_listed,
+    place_on,
+    plane_of,
+    side_seen,
+    unit_normal,
+)
+from icheat_usd.kernels.gather_rows import DETOUR, NOTHING, trace_16
+from icheat_usd.kernels.locate import nearest_sample
+from icheat_usd.kernels.random import hash_combine, to_unit
+from icheat_usd.kernels.samples import basis, unit_circle
+
+_INVALID = np.uint32(0xFFFFFFFF)
+_BLOCK = 4  # strata along each side of a packet: rays of one cone
+
+
+@kernel
+def turn_of(seed):  # type: ignore[no-untyped-def]
+    """Where the first azimuth of a hemisphere lies, in turns."""
+    return to_unit(hash_combine(seed, 0x7F4A7C15))
+
+
+@kernel
+def stratum_direction(sx, sy, sz, seed, j, k, n_theta, n_phi):  # type: ignore[no-untyped-def]
+    """A direction of stratum (j, k) about a unit normal, jittered; all strata hold the same share of the cosine.
+
+    Rings j go outwards from the normal, ``sin(theta)^2`` from ``j / n_theta`` to ``(j + 1) / n_theta``.
+    """
+    word = hash_combine(seed, j * n_phi + k)
+    u = (np.float32(j) + to_unit(word)) / np.float32(n_theta)
+    v = (np.float32(k) + to_unit(hash_combine(word, 1))) / np.float32(n_phi) + turn_of(seed)
+    if v >= np.float32(1.0):
+        v -= np.float32(1.0)
+    radius = np.float32(np.sqrt(u))
+    cosine, sine = unit_circle(v)
+    a, b = radius * cosine, radius * sine
+    c = np.float32(np.sqrt(max(np.float32(0.0), np.float32(1.0) - u)))
+    tx, ty, tz, bx, by, bz = basis(sx, sy, sz)
+    return a * tx + b * bx + c * sx, a * ty + b * by + c * sy, a * tz + b * bz + c * sz
+
+
+@kernel
+def _trace_hemisphere(  # type: ignore[no-untyped-def]
+    r,
+    trace,
+    cells,
+    locator,
+    depth,
+    points,
+    to_world,
+    to_object,
+    triangle_route,
+    position,
+    shading_normal,
+    normal,
+    own,
+    n_theta,
+    n_phi,
+    out_cell,
+    out_distance,
+    out_instance,
+    out_triangle,
+    out_uv,
+):
+    """Row r of `trace_hemispheres`."""
+    mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
+    place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
+    sample, slot, slot_detour = locator.sample, locator.slot, locator.slot_detour
+    stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
+    storage = np.zeros(24 * 16 + 16 + 64, np.float32)
+    shift = np.int64((-storage.ctypes.data % 64) // 4)
+    valid = storage[shift : shift + 16].view(np.int32)
+    rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
+    words = rays.view(np.uint32)
+    single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
+    single_words = single.view(np.uint32)
+    rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
+    sx, sy, sz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
+    gx, gy, gz = normal[r, 0], normal[r, 1], normal[r, 2]
+    for j0 in range(0, n_theta, _BLOCK):
+        for k0 in range(0, n_phi, _BLOCK):
+            for e in range(16):
+                x, y, z = stratum_direction(sx, sy, sz, own, j0 + e // _BLOCK, k0 + e % _BLOCK, n_theta, n_phi)
+                valid[e] = -1 if x * gx + y * gy + z * gz > np.float32(0.0) else 0
+                rays[0, e] = position[r, 0]
+                rays[1, e] = position[r, 1]
+                rays[2, e] = position[r, 2]
+                rays[4, e] = x
+                rays[5, e] = y
+                rays[6, e] = z
+            rays[3, :] = 0.0
+            rays[7, :] = 0.0
+            rays[8, :] = np.inf
+            words[9, :] = _INVALID
+            words[10, :] = 0
+            words[11, :] = 0
+            words[17:21, :] = _INVALID
+            trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
+            for e in range(16):
+                column = (j0 + e // _BLOCK) * n_phi + k0 + e % _BLOCK
+                out_instance[r, column] = -1
+                out_triangle[r, column] = -1
+                out_cell[r, column] = NOTHING
+                out_distance[r, column] = np.inf
+                if valid[e] == 0 or words[18, e] == _INVALID:
+                    continue
+                i = np.int64(words[18, e] if words[19, e] == _INVALID else words[19, e])
+                t = mesh_begin[instance_mesh[i]] + np.int64(words[17, e])
+                u, v = rays[15, e], rays[16, e]
+                out_instance[r, column] = i
+                out_triangle[r, column] = t
+                out_uv[r, column, 0] = u
+                out_uv[r, column, 1] = v
+                out_distance[r, column] = rays[8, e]
+                if triangle_route[t] != 0:
+                    out_cell[r, column] = DETOUR
+                    continue
+                plane = plane_of(points, to_object, i, t)
+                if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
+                    continue
+                side = side_seen(plane, rays[4, e], rays[5, e], rays[6, e])
+                found = entry_at(place, face, square, i, t, side, u, v)
+                if found < 0:
+                    px, py, pz = place_on(points, to_world, i, t, u, v)
+                    nx, ny, nz = unit_normal(plane, side)
+                    if found == WALK:
+                        found = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
+                    else:
+                        detour = slot_detour[slot[2 * i + side]]
+                        found = nearest_listed(candidates, sample, found, detour, px, py, pz, nx, ny, nz)
+                out_cell[r, column] = found
+
+
+@parallel_kernel
+def trace_hemispheres(  # type: ignore[no-untyped-def]
+    trace,
+    cells,
+    locator,
+    depth,
+    points,
+    to_world,
+    to_object,
+    triangle_route,
+    position,
+    shading_normal,
+    normal,
+    stream,
+    seed,
+    n_theta,
+    n_phi,
+    out_cell,
+    out_distance,
+    out_instance,
+    out_triangle,
+    out_uv,
+):
+    """Gather cell and distance of every ray of n hemispheres.
+
+    Parameters
+    ----------
+    trace, cells, locator : TraceTable, CellTable and table of the locator
+    depth : int
+        Of the locator's tree.
+    points, to_world, to_object : as in `Geometry`
+    triangle_route : (n_triangles,) uint8
+        1: a hit must be looked at more closely.
+    position, shading_normal, normal : (n, 3) float32
+        Starts in world space, off the surface; unit normals.
+    stream : (n,) int64
+        Number of each hemisphere's random sequence.
+    n_theta, n_phi : int
+        Strata, multiples of 4.
+    out_cell : (n, n_theta * n_phi) int32
+        Ray (j, k) in column ``j n_phi + k``: a cell, `NOTHING` or `DETOUR`.
+    out_distance : (n, n_rays) float32
+        Metres to the first surface, inf where there is none.
+    out_instance, out_triangle : (n, n_rays) int32, out_uv : (n, n_rays, 2) float32
+        The first surface; -1 where there is none.
+    """
+    for r in prange(len(stream)):
+        _trace_hemisphere(
+            r,
+            trace,
+            cells,
+            locator,
+            depth,
+            points,
+            to_world,
+            to_object,
+            triangle_route,
+            position,
+            shading_normal,
+            normal,
+            hash_combine(seed, stream[r]),
+            n_theta,
+            n_phi,
+            out_cell,
+            out_distance,
+            out_instance,
+            out_triangle,
+            out_uv,
+        )
+
+
+@parallel_kernel
+def hemisphere_directions(shading_normal, row, column, stream, seed, n_theta, n_phi, out, counter):  # type: ignore[no-untyped-def]
+    """Directions (n, 3) of rays `column` of hemispheres `row`, and a number of its own for choices on its way."""
+    for q in prange(len(row)):
+        r, ray = row[q], column[q]
+        own = hash_combine(seed, stream[r])
+        x, y, z = stratum_direction(
+            shading_normal[r, 0],
+            shading_normal[r, 1],
+            shading_normal[r, 2],
+            own,
+            ray // n_phi,
+            ray % n_phi,
+            n_theta,
+            n_phi,
+        )
+        out[q, 0], out[q, 1], out[q, 2] = x, y, z
+        counter[q] = np.int32(hash_combine(own, ray))
