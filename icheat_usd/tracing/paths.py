@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.materials import shade_hits, take_points
-from icheat_usd.scene import F32, I32, Bool, Hits, Materials, SceneSnapshot, SurfacePoints, Texture
+from icheat_usd.scene import F32, I32, Bool, DeltaKind, Hits, Materials, SceneSnapshot, SurfacePoints, Texture
 from icheat_usd.tracing._rays import checked_rays
 from icheat_usd.tracing.protocol import Tracer, spawn_points
 
@@ -42,6 +42,7 @@ def first_surfaces(
     seed: int,
     max_depth: int = 16,
     counters: I32 | None = None,
+    flux: bool = False,
 ) -> PathEnds:
     """Follow rays over everything that does not scatter them.
 
@@ -59,6 +60,10 @@ def first_surfaces(
         Deltas along one path before it is given up.
     counters : (n,) int32
         One per ray, by default its row: callers that work in blocks number their rays across blocks.
+    flux : bool
+        Whether the paths carry flux from a light instead of asking for radiance. Radiance here is the same on both
+        sides of glass; so flux that is bent into a denser medium, and squeezed there, counts less by the square of
+        the index of refraction, and as much more on its way out (Veach 1997, section 5.2).
 
     Returns
     -------
@@ -82,6 +87,8 @@ def first_surfaces(
         last = ray_direction.copy()
         state = np.empty(len(path), np.uint8)
         tracing.step_paths(points, ray_direction, counter, int(seed) & 0xFFFFFFFF, depth, throughput, state)
+        if flux:
+            _squeeze(points, ray_direction, throughput)
         travelled += hits.distance
         followed = state == tracing.FOLLOWED
         absorbed = state == tracing.ABSORBED
@@ -113,6 +120,14 @@ def first_surfaces(
         throughput, travelled = throughput[alive], travelled[alive]
     assert ends is not None
     return ends
+
+
+def _squeeze(points: SurfacePoints, onwards: F32, throughput: F32) -> None:
+    """Weigh flux that goes on through glass, in place."""
+    bent = np.flatnonzero((points.delta == DeltaKind.GLASS) & (points.instance >= 0))
+    bent = bent[np.einsum("ij,ij->i", onwards[bent], points.normal[bent]) < 0]
+    ior2 = points.ior[bent] ** 2
+    throughput[bent] *= np.where(points.side[bent] == 0, 1 / ior2, ior2)[:, None]
 
 
 def transmittance(

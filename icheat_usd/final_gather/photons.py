@@ -1,0 +1,240 @@
+"""Photons: light traced from every kind of light over diffuse reflections, mirrors and glass.
+
+They follow the same rules as gather rays and shadow rays, so that both ways of
+solving the earlier bounces agree: every reflection at a scattering surface is
+diffuse; between two of them mirrors reflect, glass bends and holes let through;
+straight from a light, glass lets ``1 - F`` through without bending it and mirrors
+block, as for shadow rays (no caustics). Edits are never seen here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icheat_usd.kernels import photons as kernels
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.tracing import straight_transmittance
+from icheat_usd.lighting import LightSampler
+from icheat_usd.materials import effective_albedo, nonzero_rows, points_on_surface, shade_hits, take_points
+from icheat_usd.progress import Progress, silent
+from icheat_usd.scene import F32, F64, I32, I64, U8, DeltaKind, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
+from icheat_usd.tracing.paths import MAX_LAYERS, passing_materials
+
+_AT_ONCE = 1 << 18  # photons in flight, to bound memory
+_PILOT = 4096  # photons that measure the power of a light
+_EQUAL_SHARE = 0.25  # of the photons, the same number for every light: each may be looked at alone
+
+# Photons start this share of the scene's radius from an analytic light: such lights are often authored in the plane
+# of a ceiling, and direct light ignores what is as near to them.
+_CLEARANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class PhotonSettings:
+    """Effort of a photon map."""
+
+    n_emitted: int = 1 << 20  #: photons that leave lights
+    n_nearest: int = 80  #: photons of one density estimate
+    max_radius: float = 0.1  #: of one density estimate, as a share of the scene's radius
+    n_bounces: int = 16  #: diffuse reflections before the last one
+    seed: int = 0
+
+
+class Photons(NamedTuple):
+    """Light that arrives at scattering surfaces."""
+
+    position: F32  #: (m, 3)
+    normal: F32  #: (m, 3) of the surface's plane, on the side that the photon came from
+    power: F32  #: (m, 3) flux that arrives, as shading with the interpolated normal sees it
+    light: I32  #: (m,) where it comes from
+    bounce: U8  #: (m,) diffuse reflections on the way; 0 is direct light
+
+    def take(self, rows: Any) -> Photons:
+        """Photons of these rows (indices or mask), contiguous."""
+        columns: list[Any] = [np.ascontiguousarray(column[rows]) for column in self]
+        return Photons(*columns)
+
+
+def trace_photons(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    settings: PhotonSettings,
+    *,
+    progress: Progress = silent,
+) -> Photons:
+    """Photons of all lights, direct ones included.
+
+    Lights share the photons by their power, a quarter equally. Each photon is a path that ends by
+    Russian roulette or after `n_bounces` arrivals; random numbers depend on (seed, light, photon, bounce) alone.
+
+    Notes
+    -----
+    Light from infinitely far, of distant lights and domes, aims at the bounding sphere of the scene. In a
+    wide landscape, or an interior that is lit through windows, most of it is spent outside.
+    """
+    found: list[Photons] = []
+    shares = _shares(snapshot, sampler, settings)
+    done, total = 0, max(int(shares.sum()), 1)
+    for light, n in enumerate(shares.tolist()):
+        for first in range(0, n, _AT_ONCE):
+            progress("trace photons", done / total)
+            count = min(_AT_ONCE, n - first)
+            own = _Bundle(snapshot, tracer, sampler, settings, light, first, n, count)
+            found += own.trace()
+            done += count
+    progress("trace photons", 1.0)
+    if not found:
+        none = np.zeros((0, 3), np.float32)
+        return Photons(none, none, none, np.zeros(0, np.int32), np.zeros(0, np.uint8))
+    columns: list[Any] = [np.concatenate(column) for column in zip(*found, strict=True)]
+    return Photons(*columns)
+
+
+def light_powers(snapshot: SceneSnapshot, sampler: LightSampler, seed: int) -> F64:
+    """Power that each light emits, (n_lights, 3); of light from infinitely far what enters the bounding sphere."""
+    powers = np.zeros((len(snapshot.lights.kind), 3))
+    for light in range(len(powers)):
+        powers[light] = _emit(snapshot, sampler, light, 0, _PILOT, _PILOT, seed)[2].sum(axis=0, dtype=np.float64)
+    return powers
+
+
+def _shares(snapshot: SceneSnapshot, sampler: LightSampler, settings: PhotonSettings) -> I64:
+    """Photons of each light."""
+    power = light_powers(snapshot, sampler, int(hash_combine(settings.seed, 0x9F))).mean(axis=1)
+    shining = power > 0
+    if not shining.any():
+        return np.zeros(len(power), np.int64)
+    share = (1 - _EQUAL_SHARE) * power / power.sum() + _EQUAL_SHARE * shining / shining.sum()
+    return np.ceil(settings.n_emitted * share).astype(np.int64)
+
+
+def _emit(
+    snapshot: SceneSnapshot, sampler: LightSampler, light: int, first: int, count: int, total: int, seed: int
+) -> tuple[F32, F32, F32]:
+    """Where photons of a light start, their directions and their power."""
+    lights = snapshot.lights
+    origin, direction = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+    power = np.zeros((count, 3), np.float32)
+    if not nonzero_rows(lights.radiance[light : light + 1])[0]:
+        return origin, direction, power
+    if lights.kind[light] != LightKind.MESH:
+        radius = float(snapshot.radius)
+        kernels.emit_from_shape(
+            lights, snapshot.textures, sampler.tables, light, radius, _CLEARANCE * radius, first, total, seed,
+            origin, direction, power,
+        )  # fmt: skip
+        return origin, direction, power
+    row, barycentric, side = np.zeros(count, np.int64), np.zeros((count, 2), np.float32), np.zeros(count, np.uint8)
+    kernels.emit_from_mesh(lights, sampler.tables, light, first, total, seed, row, barycentric, side, power)
+    instance, triangle = lights.triangle_instance[row], lights.triangle[row]
+    start = points_on_surface(snapshot, instance, triangle, barycentric, side)
+    kernels.directions_from_mesh(start.normal, light, first, seed, direction)
+    return spawn_points(snapshot, start, direction), direction, power * start.emission
+
+
+class _Bundle:
+    """Some photons of one light, from there until all of them are absorbed."""
+
+    def __init__(
+        self,
+        snapshot: SceneSnapshot,
+        tracer: Tracer,
+        sampler: LightSampler,
+        settings: PhotonSettings,
+        light: int,
+        first: int,
+        total: int,
+        count: int,
+    ) -> None:
+        self.snapshot, self.tracer, self.light, self.n_bounces = snapshot, tracer, light, settings.n_bounces
+        self.seed = int(hash_combine(hash_combine(settings.seed, 0xA0), light))
+        self.origin, self.direction, self.power = _emit(
+            snapshot, sampler, light, first, count, total, settings.seed & 0xFFFFFFFF
+        )
+        self.photon = np.arange(first, first + count, dtype=np.int32)
+
+    def trace(self) -> list[Photons]:
+        """What arrives, bounce by bounce."""
+        arrived = []
+        points = self._cross()
+        for bounce in range(self.n_bounces):
+            if bounce:
+                ends = first_surfaces(
+                    self.snapshot,
+                    self.tracer,
+                    self.origin,
+                    self.direction,
+                    int(hash_combine(self.seed, bounce)),
+                    counters=self.photon,
+                    flux=True,
+                )
+                self.power = self.power * ends.throughput
+                self.direction, points = ends.direction, ends.points
+            points = self._keep(points, (points.instance >= 0) & nonzero_rows(self.power))
+            if not len(self.photon):
+                break
+            power = np.empty_like(self.power)
+            kernels.arriving_power(points, self.direction, self.power, power)
+            self.power = power
+            # A see-through surface stops a photon by chance, but reflects what arrives for those who hit it by chance.
+            whole = (self.power / np.maximum(points.opacity, np.float32(1e-3))[:, None]).astype(np.float32)
+            arrived.append(
+                Photons(
+                    points.position,
+                    points.normal,
+                    whole,
+                    np.full(len(whole), self.light, np.int32),
+                    np.full(len(whole), bounce, np.uint8),
+                )
+            )
+            self._reflect(points, bounce)
+        return arrived
+
+    def _keep(self, points: SurfacePoints, mask: Any) -> SurfacePoints:
+        rows = np.flatnonzero(mask)
+        self.photon, self.power, self.direction = self.photon[rows], self.power[rows], self.direction[rows]
+        return take_points(points, rows)
+
+    def _reflect(self, points: SurfacePoints, bounce: int) -> None:
+        lives = np.zeros(len(self.photon), np.bool_)
+        self.direction = np.empty_like(self.direction)
+        kernels.reflect_photons(
+            points.normal, effective_albedo(points), self.photon, bounce, self.seed, self.power, self.direction, lives
+        )
+        points = self._keep(points, lives)
+        self.origin = spawn_points(self.snapshot, points, self.direction)
+
+    def _cross(self) -> SurfacePoints:
+        """Where photons first arrive, straight from the light; what is absorbed on the way loses its power."""
+        alive = np.flatnonzero(nonzero_rows(self.power))
+        origin, direction = self.origin[alive], self.direction[alive]
+        self.photon, self.power, self.direction = self.photon[alive], self.power[alive], direction
+        points = shade_hits(self.snapshot, self.tracer.intersect(origin, direction), direction)
+        passing = passing_materials(self.snapshot.materials)
+        see_through = bool(passing[np.unique(self.snapshot.geometry.material)].any())
+        crossing, on = np.arange(len(alive)), points
+        for layer in range(MAX_LAYERS):
+            goes = np.zeros(len(crossing), np.bool_)
+            if see_through:
+                share = np.empty(len(crossing), np.float32)
+                straight_transmittance(on, direction, share)
+                kernels.crossings(share, self.photon[crossing], layer, self.seed, goes)
+            goes &= on.instance >= 0
+            self.power[crossing[~goes & (on.delta != DeltaKind.NONE)]] = 0
+            rows = np.flatnonzero(goes)
+            if not len(rows):
+                break
+            crossing, direction = crossing[rows], np.ascontiguousarray(direction[rows])
+            origin = spawn_points(self.snapshot, take_points(on, rows), direction)
+            on = shade_hits(self.snapshot, self.tracer.intersect(origin, direction), direction)
+            kept: Any
+            for kept, now in zip(points, on, strict=True):
+                kept[crossing] = now
+        else:
+            self.power[crossing] = 0
+        return points
