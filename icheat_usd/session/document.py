@@ -113,8 +113,8 @@ class Session(ShotParts):
             memory=memory,
         )
 
-    def at(self, frame: float | None) -> Session:
-        """The same stage and choices at another frame."""
+    def at(self, frame: float | None, *, memory: Memory | None = None) -> Session:
+        """The same stage and choices at another frame; `memory` is for a session that has none."""
         return Session(
             self.stage,
             camera=self.camera,
@@ -126,7 +126,7 @@ class Session(ShotParts):
             tracer=self._engine,
             progress=self.progress,
             disk=self._disk,
-            memory=self._memory,
+            memory=memory if self._memory is None else self._memory,
         )
 
     @cached_property

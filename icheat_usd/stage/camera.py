@@ -24,6 +24,7 @@ class RenderChoices:
     pixel_aspect: float = 1.0
     conform: str = "expandAperture"
     depth_of_field: bool = True
+    motion_blur: bool = True
     material_purpose: str = "full"
 
 
@@ -53,6 +54,8 @@ def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode) -> RenderChoices:
         pixel_aspect=_number(settings, first("pixelAspectRatio", 1.0)),
         conform=str(first("aspectRatioConformPolicy", "expandAperture")),
         depth_of_field=not first("disableDepthOfField", False),
+        # The second is the first one's name in older stages.
+        motion_blur=not (first("disableMotionBlur", False) or first("instantaneousShutter", False)),
         material_purpose=next((str(purpose) for purpose in purposes if purpose), ""),  # type: ignore[attr-defined]
     )
 
@@ -206,6 +209,7 @@ def read_camera(
         lens = 0.5 * (0.1 * view.focalLength * unit) / view.fStop
     near, far = view.clippingRange.min * unit, view.clippingRange.max * unit
     opens, closes = camera.GetShutterOpenAttr().Get(time), camera.GetShutterCloseAttr().Get(time)
+    shutter = (float(opens or 0.0), float(closes or 0.0)) if choices.motion_blur else (0.0, 0.0)
     return Camera(
         path=path,
         to_world=_rigid(view, placement),
@@ -217,7 +221,7 @@ def read_camera(
         focus_distance=view.focusDistance * unit,
         near=near,
         far=far,
-        shutter=(float(opens or 0.0), float(closes or 0.0)),
+        shutter=shutter,
         exposure_scale=float(camera.ComputeLinearExposureScale(time)),
     )
 

@@ -1,0 +1,102 @@
+"""Motion blur: an image is the weighted mean of images at moments while the camera's shutter is open.
+
+Everything moves, as nothing is asked about motion: each moment is a session of
+its own, with its objects, deformations, camera, lights and edits. A pixel's
+camera samples are divided among the moments, so that they are as many as
+without blur, and in the same order: each moment has the next ones of the
+pixel's stratified sequence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from icheat_usd.scene import SceneSnapshot
+from icheat_usd.session.content_keys import digest
+from icheat_usd.session.document import Session
+from icheat_usd.session.frames import SharedParts
+from icheat_usd.stage.motion import may_change
+
+#: Moments of one image, at most.
+MOMENTS = 8
+
+
+class Moment(NamedTuple):
+    """A part of an image's camera samples, and the session that they look at."""
+
+    session: Session
+    weight: float  #: of its image; all weights of an image add up to 1
+    first_sample: int | None  #: number of the first camera sample of a pixel; None: the moment is the whole image
+    samples_per_pixel: int
+    edge_samples: int  #: more of them for pixels with edges, which follow
+
+
+def moments(session: Session, samples_per_pixel: int, edge_samples: int = 0, most: int = MOMENTS) -> Iterator[Moment]:
+    """Divide an image's camera samples among moments of the shutter, stratified, in order of time.
+
+    Moments at which scene and edits are the same are one. Without a shutter,
+    or where nothing changes while it is open, there is one moment: the session
+    itself, with all samples. What two moments in a row have in common is made once.
+
+    Parameters
+    ----------
+    samples_per_pixel, edge_samples
+        Of the image.
+    most
+        Of the moments; never more than `samples_per_pixel`. A single sample sees the session's own time.
+    """
+    n = min(most, samples_per_pixel)
+    interval = _open_shutter(session)
+    if interval is None or n < 2:
+        yield Moment(session, 1.0, None, samples_per_pixel, edge_samples)
+        return
+    begin, end = interval
+    shared = SharedParts()
+    first_sample, samples, edges = 0, 0, 0
+    kept: list[tuple[Session, str]] = []  # the moment in work and the one before it, each with its content
+    for k in range(n):
+        # What is in the middle of a moment's share of the samples is in the middle of its share of the time.
+        share = _part(samples_per_pixel, k, n)
+        middle = (samples_per_pixel * k // n + 0.5 * share) / samples_per_pixel
+        now = session.at(begin + (end - begin) * middle, memory=shared)
+        content = _content(now)
+        if not kept or content != kept[-1][1]:
+            if kept:
+                yield Moment(kept[-1][0], samples / samples_per_pixel, first_sample, samples, edges)
+                first_sample += samples + edges
+            samples, edges = 0, 0
+            kept = [*kept[-1:], (now, content)]
+        samples += share
+        edges += _part(edge_samples, k, n)
+    last, content = kept[-1]
+    if samples < samples_per_pixel:
+        yield Moment(last, samples / samples_per_pixel, first_sample, samples, edges)
+    else:
+        yield Moment(session if _content(session) == content else last, 1.0, None, samples, edges)
+
+
+def _part(total: int, k: int, n: int) -> int:
+    """The k-th of n parts of a number, as equal as whole numbers can be."""
+    return total * (k + 1) // n - total * k // n
+
+
+def _open_shutter(session: Session) -> tuple[float, float] | None:
+    """First and last time code of the exposure; None if nothing happens in it."""
+    snapshot = session.snapshot
+    opens, closes = snapshot.camera.shutter
+    if snapshot.time_code is None or not closes > opens:
+        return None
+    interval = snapshot.time_code + opens, snapshot.time_code + closes
+    return interval if may_change(session.stage, *interval) else None
+
+
+def _content(session: Session) -> str:
+    """Equal for sessions whose images are."""
+    return digest(_seen(session.snapshot), session.stack.digest, session.stack.enabled)
+
+
+def _seen(snapshot: SceneSnapshot) -> dict[str, object]:
+    """All of a snapshot but when it was taken and what was found."""
+    names = ("geometry", "surfaces", "materials", "textures", "lights", "light_paths", "camera", "radius")
+    return {name: getattr(snapshot, name) for name in names}
