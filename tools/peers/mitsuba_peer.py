@@ -103,20 +103,8 @@ def mitsuba_scene(mi: Any, snapshot: SceneSnapshot) -> Any:
         A light, texture or material has no counterpart in Mitsuba.
     """
     scene: dict[str, Any] = {"type": "scene"}
-    geometry, materials = snapshot.geometry, snapshot.materials
-    # Surfaces without a texture and emission are one mesh with colours: fewer shapes compile and render faster.
-    parts: dict[int, list[_Part]] = {}
-    for instance in range(snapshot.n_instances):
-        mesh = geometry.instance_mesh[instance]
-        rows = np.arange(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
-        for material in np.unique(geometry.material[rows]):
-            plain = materials.texture[material, Texture.DIFFUSE] < 0 and not materials.emission[material].any()
-            part = _part(snapshot, instance, rows[geometry.material[rows] == material])
-            parts.setdefault(-1 if plain else int(material), []).append(part)
-    for material, pieces in parts.items():
-        scene.update(
-            _meshes(mi, snapshot, material, _Part(*(np.concatenate(column) for column in zip(*pieces, strict=True))))
-        )
+    for material, part in world_parts(snapshot).items():
+        scene.update(_meshes(mi, snapshot, material, part))
     for light in range(len(snapshot.lights.kind)):
         scene.update(_light(mi, snapshot, light))
     return mi.load_dict(scene)
@@ -131,17 +119,21 @@ def render(
     samples: int,
     seed: int = 0,
     hide_emitters: bool = False,
+    roulette: int = 10_000,
 ) -> F64:
-    """Radiance (height, width, 3) of paths of up to `depth` segments, without Russian roulette.
+    """Radiance (height, width, 3) of paths of up to `depth` segments, by default without Russian roulette.
 
-    With `hide_emitters` the light that the camera sees straight from its source is left out.
+    With `hide_emitters` the light that the camera sees straight from its source is left out; from `roulette` segments
+    on paths may be ended at random.
     """
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 10_000, "hide_emitters": hide_emitters})
+    integrator = mi.load_dict(
+        {"type": "path", "max_depth": depth, "rr_depth": roulette, "hide_emitters": hide_emitters}
+    )
     image = mi.render(scene, sensor=_sensor(mi, snapshot), integrator=integrator, spp=samples, seed=seed)
     return np.array(image, np.float64)[..., :3]
 
 
-class _Part(NamedTuple):
+class Part(NamedTuple):
     """Corners of n triangles in world space, (3 n, ...) each, counter-clockwise seen from the front."""
 
     position: F64
@@ -151,7 +143,27 @@ class _Part(NamedTuple):
     st: F32
 
 
-def _part(snapshot: SceneSnapshot, instance: int, rows: I64) -> _Part:
+def world_parts(snapshot: SceneSnapshot) -> dict[int, Part]:
+    """Triangles by row of their material; those without a texture and emission are row -1, with their own colours.
+
+    Fewer shapes compile and render faster.
+    """
+    geometry, materials = snapshot.geometry, snapshot.materials
+    parts: dict[int, list[Part]] = {}
+    for instance in range(snapshot.n_instances):
+        mesh = geometry.instance_mesh[instance]
+        rows = np.arange(geometry.mesh_begin[mesh], geometry.mesh_begin[mesh + 1])
+        for material in np.unique(geometry.material[rows]):
+            plain = materials.texture[material, Texture.DIFFUSE] < 0 and not materials.emission[material].any()
+            part = _part(snapshot, instance, rows[geometry.material[rows] == material])
+            parts.setdefault(-1 if plain else int(material), []).append(part)
+    return {
+        material: Part(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
+        for material, pieces in parts.items()
+    }
+
+
+def _part(snapshot: SceneSnapshot, instance: int, rows: I64) -> Part:
     geometry = snapshot.geometry
     n = len(rows)
     # Slightly inside the corners, so that normals and colours belong to the triangle and to no neighbour.
@@ -166,14 +178,14 @@ def _part(snapshot: SceneSnapshot, instance: int, rows: I64) -> _Part:
     )
     to_world = geometry.instance_to_world[instance].astype(float)
     corners = geometry.points[rows].astype(float).reshape(-1, 3) @ to_world[:, :3].T + to_world[:, 3]
-    part = _Part(corners, points.normal, points.shading_normal, points.albedo, geometry.st[rows].reshape(-1, 2))
+    part = Part(corners, points.normal, points.shading_normal, points.albedo, geometry.st[rows].reshape(-1, 2))
     if not geometry.instance_flip[instance]:
         return part
     order = np.arange(3 * n).reshape(-1, 3)[:, ::-1].ravel()
-    return _Part(*(column[order] for column in part))
+    return Part(*(column[order] for column in part))
 
 
-def _meshes(mi: Any, snapshot: SceneSnapshot, material: int, part: _Part) -> dict[str, Any]:
+def _meshes(mi: Any, snapshot: SceneSnapshot, material: int, part: Part) -> dict[str, Any]:
     """Triangles as one mesh, or as two where they emit; material -1 stands for colours at the corners."""
     n = len(part.position) // 3
     emission = np.zeros(3) if material < 0 else snapshot.materials.emission[material]

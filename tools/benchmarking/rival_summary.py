@@ -1,0 +1,126 @@
+"""What the curves of the suite `rivals` say: tables, and ours over the others at equal time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+#: Seconds at which ours is held against the path tracer with its denoiser.
+AT_SECONDS = (1, 4, 16, 64)
+
+RAW, DENOISED = "mitsuba llvm", "mitsuba llvm + OIDN"
+_MEASURES = {"rel_mse": "untrimmed", "rel_mse_trimmed": "trimmed"}
+
+#: A curve is used this much beyond its ends.
+_SLACK = 1.1
+
+
+def curves_of(results: list[dict[str, Any]]) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    """Points by stage and renderer, by time; the efforts of ours are one curve."""
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for one in results:
+        for name, points in one.get("result", {}).get("curves", {}).items():
+            renderer = "ours" if name.startswith("ours") else name
+            found.setdefault(one["case"]["name"], {}).setdefault(renderer, []).extend(points)
+    return {
+        stage: {name: sorted(points, key=lambda point: point["seconds"]) for name, points in curves.items()}
+        for stage, curves in found.items()
+    }
+
+
+def error_at(points: list[dict[str, Any]], measure: str, seconds: float) -> float | None:
+    """Error after so many seconds, interpolated in the logarithms; None where the curve does not reach.
+
+    A slower point with a larger error than a quicker one is left out: nobody would choose it. So are errors that the
+    noise of the reference drowns.
+    """
+    times, values = [], []
+    for point in sorted(points, key=lambda point: point["seconds"]):
+        if point[measure] > 0 and (not values or point[measure] < values[-1]):
+            times.append(point["seconds"])
+            values.append(point[measure])
+    if not times or not times[0] / _SLACK <= seconds <= max(p["seconds"] for p in points) * _SLACK:
+        return None
+    return float(np.exp(np.interp(np.log(seconds), np.log(times), np.log(values))))
+
+
+def comparison(curves: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """Error times time of the path tracer over ours, and our error over the denoiser's, for one stage."""
+    found: dict[str, Any] = {"efficiency": {}, "over_denoised": {}}
+    ours = curves.get("ours", [])
+    for measure in _MEASURES:
+        raw = [point[measure] * point["seconds"] for point in curves.get(RAW, []) if point[measure] > 0]
+        if raw:
+            # Noise falls with time: the product is the same all along, and best known where it is smallest.
+            product = float(np.exp(np.mean(np.log(raw[-4:]))))
+            found["efficiency"][measure] = {
+                point["label"]: product / (point[measure] * point["seconds"]) for point in ours if point[measure] > 0
+            }
+        pairs = {
+            seconds: (error_at(ours, measure, seconds), error_at(curves.get(DENOISED, []), measure, seconds))
+            for seconds in AT_SECONDS
+        }
+        found["over_denoised"][measure] = {
+            str(seconds): mine / its for seconds, (mine, its) in pairs.items() if mine is not None and its is not None
+        }
+    return found
+
+
+def markdown(results: list[dict[str, Any]]) -> list[str]:
+    """Tables for README, and what was absent."""
+    lines: list[str] = []
+    for stage, curves in curves_of(results).items():
+        mine = [one["result"] for one in results if one["case"]["name"] == stage and "result" in one]
+        compared = comparison(curves)
+        lines += [*_about(stage, mine), "", *_table(curves, compared), "", *_at_equal_time(compared), ""]
+    return lines
+
+
+def _about(stage: str, found: list[dict[str, Any]]) -> list[str]:
+    lines = []
+    for known in (one["reference"] for one in found if "reference" in one):
+        lights = "".join(
+            f"; lights {what}: {', '.join(known[key])}"
+            for key, what in (("lights_left_out", "left out"), ("lights_added", "added"))
+            if known[key]
+        )
+        lines.append(
+            f"**{stage}**, {known['triangles']:,} triangles, paths of up to {known['depth']} segments{lights}."
+            f" Reference: {known['samples_per_half']} samples per pixel in each half, relative noise of both {known['noise']:.1e}."
+        )
+    for name, why in {name: why for one in found for name, why in one.get("absent", {}).items()}.items():
+        lines.append(f"{name}: {why}.")
+    for seconds in (one["compile_seconds"] for one in found if one.get("compile_seconds") is not None):
+        lines.append(f"Compiling mitsuba's kernel took {seconds:.1f} s more, which are not in its times.")
+    return lines
+
+
+def _table(curves: dict[str, list[dict[str, Any]]], compared: dict[str, Any]) -> list[str]:
+    lines = [
+        "| renderer | effort | time | relMSE | trimmed | mean | FLIP | relMSE x time | over path tracer's |",
+        "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    better = compared["efficiency"].get("rel_mse", {})
+    for name, points in curves.items():
+        for point in points:
+            flip = "" if point["flip"] is None else f"{point['flip']:.4f}"
+            gain = f"{better[point['label']]:.1f} x" if name == "ours" and point["label"] in better else ""
+            lines.append(
+                f"| {name} | {point['label']} | {point['seconds']:.2f} s | {point['rel_mse']:.5f} |"
+                f" {point['rel_mse_trimmed']:.5f} | {100 * (point['mean_ratio'] - 1):+.2f} % | {flip} |"
+                f" {point['rel_mse'] * point['seconds']:.4f} | {gain} |"
+            )
+    return lines
+
+
+def _at_equal_time(compared: dict[str, Any]) -> list[str]:
+    if not any(compared["over_denoised"].values()):
+        return []
+    lines = ["| our error over mitsuba + OIDN's | " + " | ".join(f"{seconds} s" for seconds in AT_SECONDS) + " |"]
+    lines.append("| --- |" + " ---: |" * len(AT_SECONDS))
+    for measure, name in _MEASURES.items():
+        found = compared["over_denoised"][measure]
+        cells = [f"{found[str(s)]:.2f}" if str(s) in found else "not reached" for s in AT_SECONDS]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return lines
