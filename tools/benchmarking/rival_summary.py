@@ -87,7 +87,8 @@ def _about(stage: str, found: list[dict[str, Any]]) -> list[str]:
         )
         lines.append(
             f"**{stage}**, {known['triangles']:,} triangles, paths of up to {known['depth']} segments{lights}."
-            f" Reference: {known['samples_per_half']} samples per pixel in each half, relative noise of both {known['noise']:.1e}."
+            f" Reference: {known['samples_per_half']} samples per pixel in each half, of a relative"
+            f" noise of {known['noise']:.1e} together."
         )
     for name, why in {name: why for one in found for name, why in one.get("absent", {}).items()}.items():
         lines.append(f"{name}: {why}.")

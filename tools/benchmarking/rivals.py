@@ -3,7 +3,8 @@
 Every renderer gets the same snapshot, camera, resolution, box filter and length of paths. Times are those of
 rendering alone: scenes are loaded and kernels compiled before, and what compiling took is said apart. Path tracers
 are followed sample by sample, and charged for the light of all paths but not for what is subtracted to get the
-indirect part; our own time has direct light in it.
+indirect part; our own time has direct light and the
+light of the gather samples in it.
 """
 
 from __future__ import annotations
@@ -16,9 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icheat_usd.edits.binding import bind
-from icheat_usd.edits.model import EMPTY_STACK
-from icheat_usd.final_gather import GatherSettings, final_gather
+from icheat_usd.final_gather import GatherSettings
 from icheat_usd.samples import view_samples
 from icheat_usd.samples.develop import average
 from icheat_usd.scene import F32, F64, Bool, SceneSnapshot
@@ -27,7 +26,8 @@ from tools.benchmarking import rival_summary
 from tools.benchmarking.mitsuba_layers import MitsubaLayers
 from tools.benchmarking.parts import Effort
 from tools.benchmarking.references import Reference, default_folder, reference
-from tools.benchmarking.render_efforts import efforts
+from tools.benchmarking.render_efforts import RenderEffort, efforts
+from tools.benchmarking.render_frame import Frame, warm
 from tools.benchmarking.render_images import write_sheet
 from tools.benchmarking.rival_errors import errors
 from tools.benchmarking.rival_scenes import RivalScene, rival_scene
@@ -145,20 +145,13 @@ def _of_reference(known: Reference, scene: RivalScene) -> dict[str, Any]:
     }
 
 
-def _ours(stand: _Stand, name: str, settings: GatherSettings) -> dict[str, Any]:
-    settings = replace(settings, n_bounces=N_BOUNCES)
-    camera = replace(stand.snapshot.camera, width=32, height=24)
-    for snapshot in (replace(stand.snapshot, camera=camera),):  # compiles
-        final_gather(snapshot, stand.tracer, bind(EMPTY_STACK, snapshot), settings=settings)
-
-    def renders() -> Iterator[_Render]:
-        start = time.perf_counter()
-        field = bind(EMPTY_STACK, stand.snapshot)
-        found = final_gather(stand.snapshot, stand.tracer, field, settings=settings)
-        seconds = time.perf_counter() - start
-        yield _Render(name, seconds, found.indirect, found.direct + found.indirect)
-
-    return {"curves": {f"ours, {name}": stand.curve(f"ours {name}", renders())}}
+def _ours(stand: _Stand, name: str, effort: RenderEffort) -> dict[str, Any]:
+    effort = RenderEffort(replace(effort.settings, n_bounces=N_BOUNCES), replace(effort.quality, n_bounces=N_BOUNCES))
+    warm(stand.snapshot, effort)
+    frame = Frame(stand.snapshot, effort)
+    found, seconds = frame.render(frame.field())
+    render = _Render(name, seconds, found.indirect, found.direct + found.indirect)
+    return {"curves": {f"ours, {name}": stand.curve(f"ours {name}", iter([render]))}, "cells": frame.light_seconds}
 
 
 def _mitsuba(stand: _Stand, variant: str, seconds: float) -> dict[str, Any]:
