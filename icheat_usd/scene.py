@@ -129,6 +129,33 @@ class Lights(NamedTuple):
     triangle_instance: I32  #: (n_emissive,)
 
 
+class Shaping(NamedTuple):
+    """How a light's radiance depends on the direction in which it is emitted; angles in radians off local -Z."""
+
+    cone: F64  #: (2,) all of it up to the first angle, smoothly less from there, none beyond the second
+    focus: float  #: power of |cos| that the radiance fades with, towards `focus_tint`; 0 does nothing
+    focus_tint: F64  #: (3,)
+    profile_scale: float  #: of the profile's vertical angles, about 0 where positive and about pi where negative
+    vertical: F64  #: (n_v,) ascending angles of a profile, 0 along -Z; beyond them it is dark
+    horizontal: F64  #: (n_h,) ascending angles about +Z, the last one 2 pi above the first; empty: no profile
+    intensity: F64  #: (n_h, n_v) factor of the radiance
+
+
+@dataclass(frozen=True, eq=False)
+class LightControls:
+    """What an artist may ask of one light beside its radiance, as UsdLux names it; as it stands, nothing."""
+
+    receivers: U8 | None = None  #: (n_instances,) 1: `lightLink` has it, the light shines on it; None: on everything
+    blockers: U8 | None = None  #: (n_instances,) 1: `shadowLink` has it, it blocks the light; None: everything does
+    diffuse: float = 1.0  #: factor of what diffuse responses, and all gather samples, make of the light
+    specular: float = 1.0  #: factor of what specular responses make of it
+    shaping: Shaping | None = None  #: of lights that are no dome and no mesh; None: even
+
+
+#: Controls of a light that asks for nothing.
+PLAIN = LightControls()
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole or thin-lens perspective camera, or an orthographic one.
@@ -178,10 +205,19 @@ class SceneSnapshot:
     centre: F64  #: (3,) metres, stage axes: subtracted from every position
     radius: float  #: of the sphere about the origin that holds all geometry; metres
     findings: tuple[Finding, ...] = field(default=())
+    light_controls: tuple[LightControls, ...] = ()  #: of each light; none where all are plain
+
+    def __post_init__(self) -> None:
+        if len(self.light_controls) not in (0, len(self.light_paths)):
+            raise ValueError(f"{len(self.light_controls)} controls for {len(self.light_paths)} lights")
 
     @property
     def n_instances(self) -> int:
         return len(self.geometry.instance_mesh)
+
+    def controls(self, light: int) -> LightControls:
+        """Controls of light `light`."""
+        return self.light_controls[light] if self.light_controls else PLAIN
 
 
 class Hits(NamedTuple):

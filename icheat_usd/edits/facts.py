@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.edits.model import Edit, Limit
-from icheat_usd.scene import F64, LightKind, SceneSnapshot
+from icheat_usd.scene import F64, PLAIN, LightKind, SceneSnapshot
 
 Facts = dict[str, str | float | int]
 
@@ -49,7 +49,7 @@ class LightFacts(NamedTuple):
 
     n: int
     kind: str  #: as in `LightKind`
-    image: str  #: digest of its texture, or ""
+    image: str  #: digest of its texture and of its controls, "" for neither
     radiance: F64  #: (3,) mean
     size: F64  #: (2,)
     place: F64  #: (3, 4)
@@ -233,6 +233,8 @@ def light_facts(snapshot: SceneSnapshot, anchor: str) -> dict[str, LightFacts]:
     for row, path in enumerate(snapshot.light_paths):
         radiance = lights.radiance[row].astype(np.float64)
         kind, image = LightKind(int(lights.kind[row])), _image_digest(snapshot, int(lights.texture[row]))
+        if snapshot.controls(row) is not PLAIN:
+            image = _sum_digests([image, _controls_digest(snapshot, row, anchor)])
         place = lights.to_world[row].astype(np.float64)
         if kind is LightKind.MESH:
             triangles = lights.triangle[lights.triangle_begin[row] : lights.triangle_begin[row + 1]]
@@ -315,6 +317,19 @@ def _look_digests(snapshot: SceneSnapshot) -> list[str]:
             digest.update(np.ascontiguousarray(geometry.color[begin:end]).data)
         found.append(digest.hexdigest())
     return found
+
+
+def _controls_digest(snapshot: SceneSnapshot, row: int, anchor: str) -> str:
+    """Of links by the surfaces' names, so that other surfaces elsewhere do not count."""
+    controls = snapshot.controls(row)
+    digest = hashlib.blake2b(repr((controls.diffuse, controls.specular)).encode(), digest_size=4)
+    for table in (controls.receivers, controls.blockers):
+        out = np.zeros(0, np.int64) if table is None else np.flatnonzero(table == 0)
+        names = {snapshot.surfaces[surface].path for surface in snapshot.geometry.instance_surface[out].tolist()}
+        digest.update(repr((table is None, sorted(relative(name, anchor) for name in names))).encode())
+    for value in controls.shaping or ():
+        digest.update(np.ascontiguousarray(value, np.float64).data)
+    return digest.hexdigest()
 
 
 def _image_digest(snapshot: SceneSnapshot, row: int) -> str:

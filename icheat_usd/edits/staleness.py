@@ -231,7 +231,7 @@ def _light_words(
     if before > 0 and after > 0 and np.abs(colours[0] - colours[1]).max() > _CHANGED:
         words.append("has another colour")
     if was.image != is_.image:
-        words.append("has another texture")
+        words.append("has another texture, other links or other shaping")
     if not np.allclose(was.size, is_.size, rtol=_CHANGED, atol=1e-7):
         words.append("has another size")
     if was.kind == "dome" or was.kind == "distant":  # Where they stand does not matter, only how they are turned.

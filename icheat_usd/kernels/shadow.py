@@ -35,7 +35,7 @@ PART = 4  #: one of so many places of a run sends a ray where that is enough
 _INVALID = np.uint32(0xFFFFFFFF)
 _STOP_SHORT = np.float32(1.0 - 1e-4)  # as for other shadow rays: lights may lie in the plane of a ceiling
 _BLOCKED, _CLEAR, _THROUGH = 0, 1, 2
-_STATES = 4  # a place knows _STATES * point + state
+STATES = 4  #: a place knows STATES * point + state
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 # Rows of a task's scratch memory, RUN floats each: direction to the chosen point (for distant lights) or way to it,
@@ -291,7 +291,7 @@ def _light_run(
         if len(through) > 0:
             through[i] = 1 + k if state[j] == _THROUGH else 0
         if len(known) > 0:
-            known[i] = _STATES * k + state[j] if k >= 0 else -1
+            known[i] = STATES * k + state[j] if k >= 0 else -1
 
 
 @kernel

@@ -33,7 +33,8 @@ def one_light(snapshot: SceneSnapshot, light: int) -> SceneSnapshot:
         triangle=lights.triangle[first:last].copy(),
         triangle_instance=lights.triangle_instance[first:last].copy(),
     )
-    return replace(snapshot, lights=alone, light_paths=(snapshot.light_paths[light],))
+    controls = snapshot.light_controls[row]
+    return replace(snapshot, lights=alone, light_paths=(snapshot.light_paths[light],), light_controls=controls)
 
 
 def join_lights(snapshot: SceneSnapshot, alone: list[SceneSnapshot]) -> SceneSnapshot:
@@ -54,7 +55,10 @@ def join_lights(snapshot: SceneSnapshot, alone: list[SceneSnapshot]) -> SceneSna
         if name != "triangle_begin"
     }
     paths = tuple(part.light_paths[0] for part in alone)
-    return replace(snapshot, textures=textures, lights=Lights(triangle_begin=begin, **columns), light_paths=paths)
+    lights = Lights(triangle_begin=begin, **columns)
+    has_controls = any(part.light_controls for part in alone)
+    controls = tuple(part.controls(0) for part in alone) if has_controls else ()
+    return replace(snapshot, textures=textures, lights=lights, light_paths=paths, light_controls=controls)
 
 
 def no_lights() -> Lights:
@@ -238,5 +242,5 @@ def new_light(
         triangle=np.empty(0, np.int32),
         triangle_instance=np.empty(0, np.int32),
     )
-    alone = replace(scene, lights=row, light_paths=(path,))
+    alone = replace(scene, lights=row, light_paths=(path,), light_controls=())
     return changed_light(images, alone, to_world=to_world, radiance=radiance, size=size, texture=texture)

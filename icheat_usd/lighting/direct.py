@@ -17,6 +17,7 @@ from icheat_usd.kernels.direct import (
     mesh_pdfs,
     sum_rays,
 )
+from icheat_usd.lighting.controls import hidden_instances, lit_instances, receives, shape, tracer_for, without
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import (
     evaluate,
@@ -28,7 +29,7 @@ from icheat_usd.materials import (
     take_points,
 )
 from icheat_usd.materials.surface import nonzero_rows
-from icheat_usd.scene import F32, F64, DeltaKind, Hits, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, Bool, DeltaKind, Hits, LightControls, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, spawn_points, transmittance
 from icheat_usd.tracing.paths import passing_materials
 
@@ -64,7 +65,8 @@ def irradiance(
     Returns
     -------
     (n_lights, n, 3) float32, irradiance: W/m^2 where radiance is in W/(m^2 sr)
-        About the shading normal; light from below the geometric normal does not count.
+        About the shading normal; light from below the geometric normal does not count. It is what diffuse
+        responses see: each light's `diffuse` is a factor, and lights shine on their receivers alone.
 
     Notes
     -----
@@ -156,6 +158,7 @@ def _direct(
     n_specular = _n_specular(counts)
     out = np.zeros((len(lights.kind), n, 3), np.float32)
     for light in np.flatnonzero(nonzero_rows(lights.radiance)).tolist():
+        controls, to_light = snapshot.controls(light), tracer_for(snapshot, tracer, light)
         delta = _is_delta(snapshot, light)
         count = 1 if delta else counts[light]
         step = max(1, _RAYS // count)
@@ -167,10 +170,13 @@ def _direct(
                 continue
             value = rays.radiance
             if to_eye is not None:
-                value = value * _response(chunk, to_eye[part], rays, None if delta else (count, n_specular))
+                shares = None if delta else (count, n_specular)
+                value = value * _response(chunk, to_eye[part], rays, shares, controls)
                 lit = np.flatnonzero(nonzero_rows(value))
                 rays, value = rays.take(lit), value[lit]
-            value = value * _visibility(snapshot, tracer, chunk, rays)
+            elif controls.diffuse != 1.0:
+                value = value * np.float32(controls.diffuse)
+            value = value * _visibility(snapshot, to_light, chunk, rays)
             _add(value, rays.point, out[light, part])
     return out
 
@@ -196,20 +202,29 @@ def _add(values: F32, point: NDArray[np.int64], out: F32) -> None:
     sum_rays(np.ascontiguousarray(values, np.float32), begin, out)
 
 
-def _response(chunk: SurfacePoints, to_eye: F32, rays: _ShadowRays, shares: tuple[int, int] | None) -> F32:
+def _response(
+    chunk: SurfacePoints, to_eye: F32, rays: _ShadowRays, shares: tuple[int, int] | None, controls: LightControls
+) -> F32:
     """BRDF times cosine; the specular part weighted by the numbers of shadow and specular rays if there are both."""
     points, eye = take_points(chunk, rays.point), to_eye[rays.point]
     glossy = np.flatnonzero(is_glossy(points))
-    if shares is None or not len(glossy):
+    is_even = controls.diffuse == controls.specular == 1.0
+    if is_even and (shares is None or not len(glossy)):
         return evaluate(points, eye, rays.direction)
     none = np.zeros_like(points.specular)
     diffuse = points._replace(specular=none, specular_edge=none)
     value = evaluate(diffuse, eye, rays.direction)
+    if not is_even:
+        value *= np.float32(controls.diffuse)
     points = take_points(points, glossy)
     terms = evaluate_specular(points, eye[glossy], rays.direction[glossy])
-    weight = _power_heuristic(shares[0] * rays.pdf[glossy].astype(np.float64), shares[1] * terms.pdf.astype(np.float64))
     lobe = points.specular * terms.base[:, None] + points.specular_edge * terms.edge[:, None]
-    value[glossy] += lobe * weight
+    if not is_even:
+        lobe *= np.float32(controls.specular)
+    if shares is not None:
+        of_rays = rays.pdf[glossy].astype(np.float64)
+        lobe *= _power_heuristic(shares[0] * of_rays, shares[1] * terms.pdf.astype(np.float64))
+    value[glossy] += lobe
     return value
 
 
@@ -227,8 +242,8 @@ def _add_specular_rays(
     lights = snapshot.lights
     glossy = np.flatnonzero(is_glossy(points))
     shapes = [i for i, kind in enumerate(lights.kind) if kind != LightKind.MESH and not _is_delta(snapshot, i)]
-    has_meshes = bool((lights.kind == LightKind.MESH).any())
-    if not len(glossy) or not (shapes or has_meshes):
+    meshes = _mesh_lights(snapshot)
+    if not len(glossy) or not (shapes or meshes):
         return
     count = _n_specular(counts)
     step = max(1, _RAYS // count)
@@ -237,33 +252,52 @@ def _add_specular_rays(
         rays = _specular_rays(snapshot, points, to_eye, chosen, seed, count)
         if not len(rays.owner):
             continue
-        unblocked: F32 | None = None
+        unblocked: dict[Tracer, F32] = {}
         for light in shapes:
-            m = len(rays.owner)
+            m, to_light = len(rays.owner), tracer_for(snapshot, tracer, light)
             distance, pdf, radiance = np.zeros(m, np.float32), np.zeros(m), np.zeros((m, 3), np.float32)
             place = (rays.points.position, rays.points.shading_normal, rays.direction)
             tables = lights, snapshot.textures, sampler.tables, sampler.guide
             meet_analytic(*tables, light, *place, distance, pdf, radiance)
+            shape(snapshot, light, rays.direction, radiance)
+            shines = nonzero_rows(radiance)
+            lit = receives(snapshot, light, rays.points.instance)
+            if lit is not None:
+                shines &= lit
             if lights.kind[light] == LightKind.DOME:
-                if unblocked is None:
-                    unblocked = transmittance(snapshot, tracer, rays.origin, rays.direction, np.inf)
-                met = np.flatnonzero(nonzero_rows(radiance) & nonzero_rows(unblocked))
-                visible = unblocked[met]
+                if to_light not in unblocked:
+                    unblocked[to_light] = transmittance(snapshot, to_light, rays.origin, rays.direction, np.inf)
+                met = np.flatnonzero(shines & nonzero_rows(unblocked[to_light]))
+                visible = unblocked[to_light][met]
             else:
-                met = np.flatnonzero(nonzero_rows(radiance))
+                met = np.flatnonzero(shines)
                 visible = transmittance(
-                    snapshot, tracer, rays.origin[met], rays.direction[met], distance[met] * _STOP_SHORT
+                    snapshot, to_light, rays.origin[met], rays.direction[met], distance[met] * _STOP_SHORT
                 )
             share = _power_heuristic(count * rays.pdf[met], counts[light] * pdf[met])
             value = rays.weight[met] * radiance[met] * visible * share
+            if snapshot.controls(light).specular != 1.0:
+                value *= np.float32(snapshot.controls(light).specular)
             sums = np.zeros((len(chosen), 3), np.float32)
             _add(value, rays.owner[met], sums)
             out[light, chosen] += sums
-        if has_meshes:
-            for light, owner, value in _mesh_hits(snapshot, tracer, sampler, rays, count, counts):
+        for hidden, some in meshes:
+            to_lights = without(snapshot, tracer, hidden)
+            for light, owner, value in _mesh_hits(snapshot, to_lights, sampler, some, rays, count, counts):
                 sums = np.zeros((len(chosen), 3), np.float32)
                 _add(value, owner, sums)
                 out[light, chosen] += sums
+
+
+def _mesh_lights(snapshot: SceneSnapshot) -> list[tuple[Bool | None, Bool]]:
+    """Glowing meshes, (n_lights,), by what does not block them, (n_instances,)."""
+    groups: dict[bytes, tuple[Bool | None, Bool]] = {}
+    for light in np.flatnonzero(snapshot.lights.kind == LightKind.MESH).tolist():
+        hidden = hidden_instances(snapshot, light)
+        key = b"" if hidden is None else hidden.tobytes()
+        group = groups.setdefault(key, (hidden, np.zeros(len(snapshot.lights.kind), np.bool_)))
+        group[1][light] = True
+    return list(groups.values())
 
 
 class _SpecularRays(NamedTuple):
@@ -294,11 +328,12 @@ def _mesh_hits(
     snapshot: SceneSnapshot,
     tracer: Tracer,
     sampler: LightSampler,
+    some: Bool,
     rays: _SpecularRays,
     count: int,
     counts: list[int],
 ) -> list[tuple[int, NDArray[np.int64], F32]]:
-    """What specular rays bring from mesh lights: light, owners (ascending) and values.
+    """What specular rays bring from some mesh lights (n_lights,): light, owners (ascending) and values.
 
     Light that shadow rays get straight through glass and holes must be found here too, so a ray goes on
     behind what it hits as long as it might get through.
@@ -312,6 +347,8 @@ def _mesh_hits(
         hits = tracer.intersect(origin, direction)
         row = sampler.emissive_rows(hits.instance, hits.triangle)
         lit = np.flatnonzero(row >= 0)
+        if not some.all():
+            lit = lit[some[sampler.emissive_light[row[lit]]]]
         if len(lit):
             found += _weigh_mesh_hits(snapshot, tracer, sampler, rays, ray[lit], row[lit], hits, lit, count, counts)
         met = np.flatnonzero(hits.instance >= 0)
@@ -349,7 +386,17 @@ def _weigh_mesh_hits(
     stop = spawn_points(snapshot, ends, -direction)
     start = rays.origin[ray]
     value = value * transmittance(snapshot, tracer, start, stop - start, 1.0)
-    return [(int(one), rays.owner[ray[light == one]], value[light == one]) for one in np.unique(light)]
+    found = []
+    for one in np.unique(light).tolist():
+        mine = light == one
+        received = receives(snapshot, one, starts.instance)
+        if received is not None:
+            mine &= received
+        brought = value[mine]
+        if snapshot.controls(one).specular != 1.0:
+            brought *= np.float32(snapshot.controls(one).specular)
+        found.append((one, rays.owner[ray[mine]], brought))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,7 +440,7 @@ def _shadow_rays(
     distance = np.zeros(n, np.float32)
     pdf = np.zeros(n, np.float32)
     radiance = np.zeros((n, 3), np.float32)
-    surface = (chunk.position, chunk.normal, chunk.shading_normal, chunk.instance)
+    surface = (chunk.position, chunk.normal, chunk.shading_normal, lit_instances(snapshot, light, chunk.instance))
     place = (*surface, first, count, seed & 0xFFFFFFFF, cosine)
     if snapshot.lights.kind[light] != LightKind.MESH:
         fill_analytic(
@@ -408,6 +455,7 @@ def _shadow_rays(
             pdf,
             radiance,
         )
+        shape(snapshot, light, direction, radiance)
         rows = np.flatnonzero(nonzero_rows(radiance))
         return _ShadowRays(rows // count, direction[rows], distance[rows], pdf[rows], radiance[rows], None)
 

@@ -13,7 +13,7 @@ from icheat_usd.lighting.guide import Effort
 from icheat_usd.lighting.quick import Shadows
 from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
 from icheat_usd.materials import evaluate_specular, is_glossy, take_points
-from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot, SurfacePoints, Textures
+from icheat_usd.scene import F32, I64, PLAIN, Bool, LightControls, LightKind, SceneSnapshot, SurfacePoints, Textures
 from icheat_usd.tracing import Tracer, spawn_points
 
 _RAYS = 1 << 18  # at a time
@@ -32,9 +32,14 @@ class SeenSky:
     tint: F32  #: (n, 3) albedo over pi
     gloss_tint: F32  #: (n, 3) colour of the specular lobe
 
-    def light(self, sky: F32, out: F32) -> None:
+    def light(self, sky: F32, out: F32, controls: LightControls = PLAIN) -> None:
         """Reflected light of a binned sky (n_bins, 3), into `out` (n, 3)."""
-        kernels.shine(self.begin, self.bins, self.diffuse, self.glossy, sky, self.tint, self.gloss_tint, out)
+        tint, gloss_tint = self.tint, self.gloss_tint
+        if controls.diffuse != 1.0:
+            tint = tint * np.float32(controls.diffuse)
+        if controls.specular != 1.0:
+            gloss_tint = gloss_tint * np.float32(controls.specular)
+        kernels.shine(self.begin, self.bins, self.diffuse, self.glossy, sky, tint, gloss_tint, out)
 
 
 def white_sky(
@@ -57,6 +62,7 @@ def see_sky(
     n_samples: int,
     seed: int,
     begin: I64 | None = None,
+    lit: Bool | None = None,
 ) -> SeenSky:
     """Sample where places see the sky.
 
@@ -70,6 +76,8 @@ def see_sky(
         Rays per point.
     begin : (n_places + 1,)
         A place is the mean of its points; by default every point is one.
+    lit : (n,) bool, optional
+        Points that the sky shines on; by default all.
     """
     # empty ones first: a camera may see no surface
     owners, bins = [np.empty(0, np.int64)], [np.empty(0, np.uint16)]
@@ -79,6 +87,9 @@ def see_sky(
     for first in range(0, len(points.instance), step):
         part = take_points(points, slice(first, first + step))
         point, direction, value = _visible(even, sampler, shadows, part, first, n_samples, seed)
+        if lit is not None:
+            kept = np.flatnonzero(lit[first + point])
+            point, direction, value = point[kept], np.take(direction, kept, axis=0), value[kept]
         cosine = np.maximum(np.einsum("ij,ij->i", part.shading_normal[point], direction), 1e-6)
         owners.append(point + first)
         row = np.empty(len(point), np.uint16)

@@ -19,6 +19,7 @@ from icheat_usd.kernels.guide import (
     smooth_planes,
 )
 from icheat_usd.kernels.lights import LightTables
+from icheat_usd.lighting.controls import tracer_for
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, spawn_points, transmittance
@@ -120,10 +121,11 @@ def learn_guide(
     n_rows = 0
     for light in domes.tolist():
         square = np.zeros((len(keys), _CELLS), np.float32)
+        to_light = tracer_for(snapshot, tracer, light)
         for turn in range(effort.rays):
             for first in range(0, len(keys), _GROUPS_AT_ONCE):
                 part = begin[first : first + _GROUPS_AT_ONCE + 1]
-                found = _pilot(snapshot, tracer, tables, light, points, start, part, first, seed + turn)
+                found = _pilot(snapshot, to_light, tables, light, points, start, part, first, seed + turn)
                 square[first : first + len(part) - 1] += found / np.float32(effort.rays)
                 yield
         weight, useful = _weights(square, keys, textured=bool(lights.texture[light] >= 0))

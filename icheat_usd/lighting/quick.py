@@ -10,9 +10,11 @@ import numpy as np
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers
 from icheat_usd.kernels.shadow import GLOSS, PART, RUN, STRIDE, light_places
+from icheat_usd.kernels.shaping import shape_places
+from icheat_usd.lighting.controls import darken, emission_frame, without
 from icheat_usd.lighting.points import light_points
 from icheat_usd.materials import is_glossy
-from icheat_usd.scene import F32, I32, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import build_tracer, spawn_points
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.tracing.paths import passing_materials
@@ -52,19 +54,27 @@ class Shadows:
         return out
 
 
-def build_shadows(snapshot: SceneSnapshot, tracer: EmbreeTracer) -> Shadows:
-    """Tracers of the opaque and of the other triangles; `tracer` itself where all are opaque."""
+def build_shadows(snapshot: SceneSnapshot, tracer: EmbreeTracer, hidden: Bool | None = None) -> Shadows:
+    """Tracers of the opaque and of the other triangles; `tracer` itself where all are opaque.
+
+    Parameters
+    ----------
+    hidden : (n_instances,) bool, optional
+        Instances that cast no shadow.
+    """
     passes = passing_materials(snapshot.materials)[snapshot.geometry.material]
     if not passes.any():
-        return Shadows(tracer, None)
-    return Shadows(_tracer_of(snapshot, ~passes), _tracer_of(snapshot, passes))
+        opaque = without(snapshot, tracer, hidden)
+        assert isinstance(opaque, EmbreeTracer)
+        return Shadows(opaque, None)
+    return Shadows(_tracer_of(snapshot, ~passes, hidden), _tracer_of(snapshot, passes, hidden))
 
 
-def _tracer_of(snapshot: SceneSnapshot, kept: np.ndarray) -> EmbreeTracer:
+def _tracer_of(snapshot: SceneSnapshot, kept: np.ndarray, hidden: Bool | None) -> EmbreeTracer:
     """Tracer of some triangles; the others shrink to points, which no ray meets, so that all keep their numbers."""
     points = snapshot.geometry.points.copy()
     points[~kept] = points[~kept][:, :1]
-    tracer = build_tracer(replace(snapshot, geometry=snapshot.geometry._replace(points=points)))
+    tracer = build_tracer(replace(snapshot, geometry=snapshot.geometry._replace(points=points)), hidden=hidden)
     assert isinstance(tracer, EmbreeTracer)
     return tracer
 
@@ -74,6 +84,7 @@ class Places:
     """Surface points made ready for `direct_at`, in runs; see `kernels.shadow.light_places`."""
 
     row: I32  #: (n,) point of each place
+    instance: I32  #: (n,) of each point
     place: F32  #: (n_runs, 9, RUN)
     tint: F32  #: (n_runs, 3, RUN)
     gloss: F32  #: (n_lobed, 12, RUN), none where no lobe is wanted
@@ -113,7 +124,8 @@ def prepare_places(
         every = _runs(_lobes(points, to_eye), order)
         lobed = every[:, _ALPHA].any(axis=1)
         gloss, lobes[lobed] = every[lobed], np.arange(lobed.sum(), dtype=np.int32)
-    return Places(row, _runs(place, order), _runs(albedo / np.float32(np.pi), order), gloss, lobes)
+    tint = _runs(albedo / np.float32(np.pi), order)
+    return Places(row, points.instance, _runs(place, order), tint, gloss, lobes)
 
 
 def _runs(table: F32, order: I64 | None) -> F32:
@@ -155,15 +167,24 @@ def direct_at(
 
     Parameters
     ----------
+    shadows
+        Without what does not block the light; see `lighting.controls.hidden_instances`.
     last : LastLook, optional
         Of the same light and turn somewhere near: most places take their shadow from it. It is brought up to date.
     """
+    controls = snapshot.controls(0)
+    tint, gloss = places.tint, places.gloss
+    if controls.diffuse != 1.0:
+        tint = tint * np.float32(controls.diffuse)
+    if controls.specular != 1.0:
+        gloss = gloss.copy()
+        gloss[:, :_ALPHA] *= np.float32(controls.specular)
     table, distant = light_points(snapshot, seed)
     groups = light_groups(table, _FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
     through = np.empty(0 if shadows.passing is None else places.n, np.int32)
     function, opaque = shadows.opaque.address_of("rtcOccluded16")
     passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
-    phase, known = -1, np.empty(0, np.int16)
+    phase, known = -1, np.empty(0 if controls.shaping is None else places.n, np.int16)
     if last is not None:
         known = last.known
         phase = last.n % PART if last.n else -1
@@ -180,8 +201,8 @@ def direct_at(
         seed,
         turn,
         places.place,
-        places.tint,
-        places.gloss,
+        tint,
+        gloss,
         places.lobes,
         share_rays,
         phase,
@@ -195,6 +216,11 @@ def direct_at(
         origin, end = places.place[rows // RUN, :3, rows % RUN], table[through[rows] - 1, :3]
         direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
         out[places.row[rows]] *= shadows.crossing(snapshot, origin, direction, limit)[:, None]
+    if controls.shaping is not None:
+        # The choice among points was made without it, which the mean over choices does not notice.
+        frame = emission_frame(snapshot, 0)
+        shape_places(controls.shaping, *frame, table, distant, places.place, known, places.row, out)
+    darken(snapshot, 0, places.instance, out)
 
 
 class LightGroups(NamedTuple):

@@ -17,6 +17,7 @@ from icheat_usd.lighting import (
     reflected_direct,
     samples_per_light,
 )
+from icheat_usd.lighting.controls import darken, hidden_instances, receives, tracer_for
 from icheat_usd.lighting.domes import BinnedSky, SeenSky, see_sky, white_sky
 from icheat_usd.lighting.guide import LITTLE, Steps
 from icheat_usd.lighting.points import has_points
@@ -73,37 +74,60 @@ class Surroundings:
 
     seed: int
     sparse: SparseView | None = None
-    _sky: list[SeenSky] = field(default_factory=list)  #: of cells and view, once a dome asks for them
+    #: Of cells and view, once a dome asks for them; by what the domes' controls say.
+    _skies: dict[tuple[bytes, bytes], list[SeenSky]] = field(default_factory=dict)
+    _others: dict[bytes, Shadows] = field(default_factory=dict)  #: without what does not block some lights
 
-    def sky(self) -> list[SeenSky]:
-        """What the cells and the view samples see of the sky; found when first needed, which takes seconds."""
-        if not self._sky:
-            assert self.shadows is not None
-            gather, view = self.gather, self.view
-            effort = None if self.sparse is None else LITTLE
-            even, sampler = white_sky(self.snapshot, self.tracer, gather.patch_points, self.seed, effort)
-            n_of_cells = _SKY_OF_CELLS if self.sparse is None else _SKY_OF_FEW_CELLS
-            ways = (even, sampler, self.shadows)
-            tint = self.cell_means(self.patch_tint)
-            view_tint = view.points.albedo / np.float32(np.pi)
-            self._sky.append(see_sky(*ways, gather.patch_points, tint, None, n_of_cells, self.seed, gather.cell_begin))
-            if self.sparse is None:
-                self._sky.append(see_sky(*ways, view.points, view_tint, view.to_eye, _SKY_OF_VIEW, self.seed + 1))
-            else:
-                few = take_points(view.points, self.sparse.samples.astype(np.int64))
-                white = np.full((len(few.instance), 3), 1.0 / np.pi, np.float32)
-                self._sky.append(see_sky(*ways, few, white, None, _SKY_OF_FEW, self.seed + 1))
-        return self._sky
+    def shadows_of(self, alone: SceneSnapshot) -> Shadows:
+        """For shadow rays to the light of a one-light snapshot; lights that are blocked alike share them."""
+        assert self.shadows is not None and isinstance(self.tracer, EmbreeTracer)
+        hidden = hidden_instances(alone, 0)
+        if hidden is None:
+            return self.shadows
+        key = hidden.tobytes()
+        if key not in self._others:
+            self._others[key] = build_shadows(self.snapshot, self.tracer, hidden)
+        return self._others[key]
 
-    def light_view(self, sky: F32, out: F32) -> None:
-        """What the view samples reflect of a binned sky; diffusely, if it is looked at from few of them."""
-        of_view = self.sky()[1]
+    def sky(self, alone: SceneSnapshot) -> list[SeenSky]:
+        """What the cells and the view samples see of the sky of a dome; found when first needed, which takes seconds.
+
+        Domes with the same blockers and receivers share it.
+        """
+        hidden, receivers = hidden_instances(alone, 0), alone.controls(0).receivers
+        key = (b"" if hidden is None else hidden.tobytes(), b"" if receivers is None else receivers.tobytes())
+        if key not in self._skies:
+            self._skies[key] = self._see_sky(alone)
+        return self._skies[key]
+
+    def _see_sky(self, alone: SceneSnapshot) -> list[SeenSky]:
+        gather, view = self.gather, self.view
+        effort = None if self.sparse is None else LITTLE
+        tracer = tracer_for(alone, self.tracer, 0)
+        even, sampler = white_sky(self.snapshot, tracer, gather.patch_points, self.seed, effort)
+        n_of_cells = _SKY_OF_CELLS if self.sparse is None else _SKY_OF_FEW_CELLS
+        ways = (even, sampler, self.shadows_of(alone))
+        tint = self.cell_means(self.patch_tint)
+        lit = receives(alone, 0, gather.patch_points.instance)
+        patches, begin = gather.patch_points, gather.cell_begin
+        of_cells = see_sky(*ways, patches, tint, None, n_of_cells, self.seed, begin, lit)
         if self.sparse is None:
-            of_view.light(sky, out)
-            return
-        few = np.empty((len(self.sparse.samples), 3), np.float32)
-        of_view.light(sky, few)
-        np.multiply(self.sparse.interpolation.matmul(few), self.view.points.albedo, out=out)
+            view_tint = view.points.albedo / np.float32(np.pi)
+            return [of_cells, see_sky(*ways, view.points, view_tint, view.to_eye, _SKY_OF_VIEW, self.seed + 1)]
+        few = take_points(view.points, self.sparse.samples.astype(np.int64))
+        white = np.full((len(few.instance), 3), 1.0 / np.pi, np.float32)
+        return [of_cells, see_sky(*ways, few, white, None, _SKY_OF_FEW, self.seed + 1)]
+
+    def light_view(self, alone: SceneSnapshot, sky: F32, out: F32) -> None:
+        """What the view samples reflect of a dome's binned sky; diffusely, if it is looked at from few of them."""
+        of_view, controls = self.sky(alone)[1], alone.controls(0)
+        if self.sparse is None:
+            of_view.light(sky, out, controls)
+        else:
+            few = np.empty((len(self.sparse.samples), 3), np.float32)
+            of_view.light(sky, few, controls)
+            np.multiply(self.sparse.interpolation.matmul(few), self.view.points.albedo, out=out)
+        darken(alone, 0, self.view.points.instance, out)
 
     def can_move(self, alone: SceneSnapshot) -> bool:
         """Whether the light of a one-light snapshot has the quick way."""
@@ -236,17 +260,18 @@ class MovingLight:
         """
         around = self._around
         self.following = last = self.following or Following(around)
-        assert around.shadows is not None and around.cells is not None and around.tiles is not None
+        assert around.cells is not None and around.tiles is not None
         direct = np.empty((around.gather.n, 3), np.float32)
-        direct_at(self._alone, around.shadows, around.cells, self._seed, False, direct, last=last.cells)
+        shadows = around.shadows_of(self._alone)
+        direct_at(self._alone, shadows, around.cells, self._seed, False, direct, last=last.cells)
         around.bounce(direct, radiance, self.direct, last.next_part())
         self.direct = direct
-        direct_at(self._alone, around.shadows, around.tiles, self._seed, True, view_direct, last=last.view)
+        direct_at(self._alone, shadows, around.tiles, self._seed, True, view_direct, last=last.view)
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """Another round at the cells or at the view; False after the last."""
         around = self._around
-        assert around.shadows is not None and around.patches is not None and around.tiles is not None
+        assert around.patches is not None and around.tiles is not None
         if self._step == 0:
             self._cells, self._view = (np.zeros((n, 3), np.float32) for n in (around.gather.n, around.view.n))
         turn, at_view = divmod(self._step, 2)
@@ -260,7 +285,7 @@ class MovingLight:
             return self._find_highlights(view_direct)
         places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
         found = np.empty((places.n, 3), np.float32)
-        direct_at(self._alone, around.shadows, places, self._seed, False, found, turn)
+        direct_at(self._alone, around.shadows_of(self._alone), places, self._seed, False, found, turn)
         into += found if at_view else around.cell_means(found)
         share = np.float32(1.0 / (turn + 1))
         if at_view:
@@ -308,15 +333,15 @@ class AnyLight:
         """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample."""
         around = self._around
         if around.shadows is not None and self._alone.lights.kind[0] == LightKind.DOME:
-            of_cells = around.sky()[0]
+            of_cells = around.sky(self._alone)[0]
             self.bins = self.bins or BinnedSky(self._alone)
             sky = self.bins.under(self._alone)
             direct = np.empty((around.gather.n, 3), np.float32)
-            of_cells.light(sky, direct)
+            of_cells.light(sky, direct, self._alone.controls(0))
             self.following = self.following or Following(around)
             around.bounce(direct, radiance, self.direct, self.following.next_part())
             self.direct = direct
-            around.light_view(sky, view_direct)
+            around.light_view(self._alone, sky, view_direct)
             return
         patch = around.gather.cell_begin[:-1]
         points = take_points(around.gather.patch_points, patch)

@@ -94,7 +94,9 @@ def _lights(snapshot: SceneSnapshot, kind: LightKind | None) -> str:
     ]
     per_light = ("kind", "to_world", "radiance", "size", "surface")
     columns = [getattr(lights, name)[which] for name in per_light]
-    return digest(snapshot.radius, columns, spans, _images(snapshot, lights.texture[which]))
+    # How a camera sees the sky does not depend on what the sky lights.
+    controls = snapshot.light_controls if kind is None else ()
+    return digest(snapshot.radius, columns, spans, controls, _images(snapshot, lights.texture[which]))
 
 
 def light_digest(lights: Lights, row: int) -> str:

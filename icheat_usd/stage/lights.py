@@ -16,15 +16,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
 from icheat_usd.errors import EditError
 from icheat_usd.scene import F64, Finding, Geometry, LightKind, Lights, Materials, Surface, Texture, Textures
-from icheat_usd.stage.reporting import Reporter
-from icheat_usd.stage.shading import resolve_input, time_code
+from icheat_usd.stage.light_inputs import LightInputs
+from icheat_usd.stage.shading import time_code
 from icheat_usd.stage.textures import TextureLibrary
 from icheat_usd.stage.transforms import Placement, from_gf
 
@@ -93,7 +92,7 @@ def read_lights(
     """
     reader = _Reader(time_code(time), placement, textures)
     rows = [row for prim in prims for row in reader.read(prim)]
-    return _table(rows), tuple(row.path for row in rows), list(reader.report.findings())
+    return _table(rows), tuple(row.path for row in rows), list(reader.inputs.report.findings())
 
 
 def read_mesh_factors(prims: Iterable[Usd.Prim], time: Usd.TimeCode | float | None) -> dict[str, F64]:
@@ -291,7 +290,7 @@ class _Reader:
         self.time = time
         self.placement = placement
         self.textures = textures
-        self.report = Reporter()
+        self.inputs = LightInputs(time)
         self.transforms = UsdGeom.XformCache(time)
         self.kinds: dict[str, Callable[[Usd.Prim, F64], _Light | None]] = {
             "SphereLight": self._sphere,
@@ -310,7 +309,6 @@ class _Reader:
         if kind not in self.kinds:
             self._report_kind(prim, kind)
             return []
-        self._report_unsupported(prim, kind)
         # Stage units; the placement turns it to metres once the sizes that need stage units are known.
         light = self.kinds[kind](prim, from_gf(self.transforms.GetLocalToWorldTransform(prim))[:, :3])
         return [] if light is None else [light]
@@ -327,32 +325,32 @@ class _Reader:
     # Kinds --------------------------------------------------------------------------------------
 
     def _sphere(self, prim: Usd.Prim, linear: F64) -> _Light | None:
-        radius = self._number(prim, "radius", 0.5)
+        radius = self.inputs.number(prim, "radius", 0.5)
         as_point = bool(prim.GetAttribute("treatAsPoint").Get(self.time))
         if radius <= 0.0 and as_point:
             scale = float(np.linalg.norm(linear, 2)) * self.placement.meters_per_unit
             radius = POINT_RADIUS / scale if scale > 0.0 else POINT_RADIUS
         elif as_point:
-            self._unsupported(prim, "treatAsPoint", "the light is a sphere of its radius")
+            self.inputs.unsupported(prim, "treatAsPoint", "the light is a sphere of its radius")
         return self._area_light(prim, LightKind.SPHERE, (radius, 0.0), sphere_area(linear, radius))
 
     def _disk(self, prim: Usd.Prim, linear: F64) -> _Light | None:
-        radius = self._number(prim, "radius", 0.5)
+        radius = self.inputs.number(prim, "radius", 0.5)
         return self._area_light(prim, LightKind.DISK, (radius, 0.0), disk_area(linear, radius))
 
     def _rect(self, prim: Usd.Prim, linear: F64) -> _Light | None:
-        width, height = self._number(prim, "width", 1.0), self._number(prim, "height", 1.0)
+        width, height = self.inputs.number(prim, "width", 1.0), self.inputs.number(prim, "height", 1.0)
         texture = self._texture(prim, "clamp", "clamp")
         return self._area_light(prim, LightKind.RECT, (width, height), rect_area(linear, width, height), texture)
 
     def _cylinder(self, prim: Usd.Prim, linear: F64) -> _Light | None:
-        radius, length = self._number(prim, "radius", 0.5), self._number(prim, "length", 1.0)
+        radius, length = self.inputs.number(prim, "radius", 0.5), self.inputs.number(prim, "length", 1.0)
         if prim.GetAttribute("treatAsLine").Get(self.time):
-            self._unsupported(prim, "treatAsLine", "the light is a cylinder of its radius")
+            self.inputs.unsupported(prim, "treatAsLine", "the light is a cylinder of its radius")
         return self._area_light(prim, LightKind.CYLINDER, (radius, length), cylinder_area(linear, radius, length))
 
     def _distant(self, prim: Usd.Prim, linear: F64) -> _Light | None:
-        half_angle = math.radians(min(max(self._number(prim, "angle", 0.53), 0.0), 360.0)) / 2.0
+        half_angle = math.radians(min(max(self.inputs.number(prim, "angle", 0.53), 0.0), 360.0)) / 2.0
         factor = distant_size_factor(half_angle)
         return self._light(prim, LightKind.DISTANT, (half_angle, 0.0), self.radiance(prim, factor, 50000.0))
 
@@ -368,7 +366,7 @@ class _Reader:
         self, prim: Usd.Prim, kind: LightKind, size: tuple[float, float], area: float, texture: int = -1
     ) -> _Light | None:
         if not area > 0.0:
-            self.report(
+            self.inputs.report(
                 prim.GetPath(),
                 "size",
                 "it has no area and gives no light; give it a size, or a transform that does not flatten it.",
@@ -386,16 +384,18 @@ class _Reader:
 
     def radiance(self, prim: Usd.Prim, size_factor: float | None, default_intensity: float) -> F64:
         """Radiance of a light; a size factor of None stands for a light that ignores `normalize`."""
-        color = self._value(prim, "color", Gf.Vec3f(1.0))
+        color = self.inputs.value(prim, "color", Gf.Vec3f(1.0))
         radiance = np.array([float(c) for c in color], np.float64)
-        radiance *= self._number(prim, "intensity", default_intensity) * 2.0 ** self._number(prim, "exposure", 0.0)
-        if self._value(prim, "enableColorTemperature", False):
-            kelvin = self._number(prim, "colorTemperature", 6500.0)
+        radiance *= self.inputs.number(prim, "intensity", default_intensity) * 2.0 ** self.inputs.number(
+            prim, "exposure", 0.0
+        )
+        if self.inputs.value(prim, "enableColorTemperature", False):
+            kelvin = self.inputs.number(prim, "colorTemperature", 6500.0)
             radiance *= np.array(list(UsdLux.BlackbodyTemperatureAsRgb(kelvin)), np.float64)
-        if size_factor is not None and self._value(prim, "normalize", False):
+        if size_factor is not None and self.inputs.value(prim, "normalize", False):
             radiance /= size_factor
         if not (np.isfinite(radiance).all() and (radiance >= 0.0).all()):
-            self.report(
+            self.inputs.report(
                 prim.GetPath(),
                 "radiance",
                 "it has a negative or infinite radiance, which counts as 0; check its color, intensity and exposure.",
@@ -403,100 +403,31 @@ class _Reader:
             radiance = np.where(np.isfinite(radiance), np.maximum(radiance, 0.0), 0.0)
         return radiance
 
-    def _number(self, prim: Usd.Prim, name: str, default: float) -> float:
-        value = self._value(prim, name, default)
-        return float(value)
-
-    def _value(self, prim: Usd.Prim, name: str, default: Any) -> Any:
-        source = resolve_input(UsdShade.ConnectableAPI(prim), name, self.time)
-        if source.node is not None:
-            self._unsupported(prim, name, f"{source.node.GetPath()} is connected to it, and its plain value is used")
-            value = UsdShade.ConnectableAPI(prim).GetInput(name).GetAttr().Get(self.time)
-        else:
-            value = source.value
-        return default if value is None else value
-
     def _texture(self, prim: Usd.Prim, wrap_s: str, wrap_t: str) -> int:
-        asset = self._value(prim, "texture:file", None)
+        asset = self.inputs.value(prim, "texture:file", None)
         if not isinstance(asset, Sdf.AssetPath) or not asset.path:
             return -1
-        layout = self._value(prim, "texture:format", "automatic")
+        layout = self.inputs.value(prim, "texture:format", "automatic")
         if layout not in ("automatic", "latlong"):
-            self._unsupported(prim, "texture:format", f"'{layout}' images are not read, and its plain colour is used")
+            self.inputs.unsupported(
+                prim, "texture:format", f"'{layout}' images are not read, and its plain colour is used"
+            )
             return -1
         return self.textures.add(asset, "auto", wrap_s, wrap_t, prim_path=str(prim.GetPath()))
 
     # Findings -----------------------------------------------------------------------------------
 
-    def _unsupported(self, prim: Usd.Prim, feature: str, consequence: str) -> None:
-        self.report(prim.GetPath(), feature, f"{feature} is not supported; {consequence}.")
-
     def _report_kind(self, prim: Usd.Prim, kind: str) -> None:
         if prim.IsA(UsdGeom.Mesh):
             mode = _material_mode(prim)
             if mode != GLOW:
-                self._unsupported(
+                self.inputs.unsupported(
                     prim, "light:materialSyncMode", f"'{mode}' is ignored, and the mesh shines by its material alone"
                 )
-            elif self._value(prim, "normalize", False):
-                self._unsupported(prim, "normalize", "a mesh shines by its radiance, whatever its area")
-            self._report_unsupported(prim, kind)
+            elif self.inputs.value(prim, "normalize", False):
+                self.inputs.unsupported(prim, "normalize", "a mesh shines by its radiance, whatever its area")
             return
         if prim.IsA(UsdGeom.Gprim):
-            self._unsupported(prim, "LightAPI", f"a {kind} shines by the emission of its material alone")
+            self.inputs.unsupported(prim, "LightAPI", f"a {kind} shines by the emission of its material alone")
             return
-        self._unsupported(prim, kind or "LightAPI", "it gives no light")
-
-    def _report_unsupported(self, prim: Usd.Prim, kind: str) -> None:
-        for name in ("diffuse", "specular"):
-            if self._number(prim, name, 1.0) != 1.0:
-                self._unsupported(prim, name, "the light acts on both responses in full")
-        light = UsdLux.LightAPI(prim)
-        for collection, what in (
-            (light.GetLightLinkCollectionAPI(), "lightLink"),
-            (light.GetShadowLinkCollectionAPI(), "shadowLink"),
-        ):
-            if not self._includes_everything(collection):
-                self._unsupported(prim, what, "the light acts on everything")
-        if light.GetFiltersRel().GetTargets():
-            self._unsupported(prim, "light:filters", "the light is not filtered")
-        self._report_shaping(prim, kind)
-        shadow = UsdLux.ShadowAPI(prim)
-        if shadow.GetShadowEnableAttr().Get(self.time) is False:
-            self._unsupported(prim, "shadow:enable", "the light casts shadows")
-        tint = shadow.GetShadowColorAttr().Get(self.time)
-        if tint is not None and any(c != 0.0 for c in tint):
-            self._unsupported(prim, "shadow:color", "its shadows are black")
-        for attribute, name in (
-            (shadow.GetShadowDistanceAttr(), "shadow:distance"),
-            (shadow.GetShadowFalloffAttr(), "shadow:falloff"),
-        ):
-            distance = attribute.Get(self.time)
-            if distance is not None and distance >= 0.0:
-                self._unsupported(prim, name, "its shadows reach everywhere")
-
-    @staticmethod
-    def _includes_everything(collection: Usd.CollectionAPI) -> bool:
-        if not collection:
-            return True
-        include_root = collection.GetIncludeRootAttr().Get()
-        expression = collection.GetMembershipExpressionAttr().Get()
-        return (
-            include_root is not False
-            and not collection.GetExcludesRel().GetTargets()
-            and not (expression is not None and str(expression))
-        )
-
-    def _report_shaping(self, prim: Usd.Prim, kind: str) -> None:
-        shaping = UsdLux.ShapingAPI(prim)
-        focus = shaping.GetShapingFocusAttr().Get(self.time)
-        if focus:
-            self._unsupported(prim, "shaping:focus", "the light spreads evenly")
-        cone = shaping.GetShapingConeAngleAttr()
-        # A cone of 90 degrees is all that a flat light fills, and what ShapingAPI falls back to.
-        widest = 90.0 if kind in ("RectLight", "DiskLight") or not cone.HasAuthoredValue() else 180.0
-        if cone and (cone.Get(self.time) or 0.0) < widest and cone.HasAuthoredValue():
-            self._unsupported(prim, "shaping:cone:angle", "the light is not cut to a cone")
-        profile = shaping.GetShapingIesFileAttr().Get(self.time)
-        if profile is not None and profile.path:
-            self._unsupported(prim, "shaping:ies:file", "the light has no profile")
+        self.inputs.unsupported(prim, kind or "LightAPI", "it gives no light")

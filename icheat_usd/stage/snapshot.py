@@ -12,6 +12,7 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.stage.camera import find_camera, frame_camera, read_camera, read_render_choices
 from icheat_usd.stage.instancing import InstancerReader
+from icheat_usd.stage.light_controls import read_controls
 from icheat_usd.stage.lights import read_lights, read_mesh_factors, with_mesh_lights
 from icheat_usd.stage.materials import MaterialLibrary
 from icheat_usd.stage.opening import composition_findings, quiet_usd
@@ -112,8 +113,10 @@ def take_snapshot(
             materials.textures.table(),
             read_mesh_factors(lights_shown, when),
         )
+        controls, control_findings = read_controls(lights_shown, when, light_paths, builder.surfaces, geometry, tables)
         report.extend(materials.findings)
         report.extend(light_findings)
+        report.extend(control_findings)
 
         if camera_prim is None:
             half = np.zeros(3) if bounds is None else 0.5 * (bounds[1] - bounds[0]) * meters_per_unit
@@ -129,6 +132,7 @@ def take_snapshot(
             textures=materials.textures.table(),
             lights=lights,
             light_paths=light_paths,
+            light_controls=controls,
             camera=view,
             stage_path=stage.GetRootLayer().realPath or stage.GetRootLayer().identifier,
             time_code=code,

@@ -179,7 +179,7 @@ class TextureLibrary:
             )
             return self._remember(key, -1)
         try:
-            stored = read_texture(_content(resolved), resolved)
+            stored = read_texture(asset_content(resolved), resolved)
         except ImageError as error:
             self.report(prim_path, f"texture {authored}", f"{error} The fallback is used.")
             return self._remember(key, -1)
@@ -197,7 +197,7 @@ class TextureLibrary:
         return image
 
 
-def _content(resolved: str) -> str | bytes:
+def asset_content(resolved: str) -> str | bytes:
     """A path to read from disk, or the bytes of an asset that lives elsewhere, such as in a usdz package."""
     if os.path.exists(resolved):
         return resolved

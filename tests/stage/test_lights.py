@@ -102,7 +102,7 @@ def test_an_invisible_ancestor_hides_a_light(tmp_path: Path) -> None:
 
 
 def test_lights_inside_instances_have_scene_paths_and_their_own_places(tmp_path: Path) -> None:
-    body = 'class "Torch"\n{\n' + light("SphereLight", "float inputs:shaping:focus = 2") + "}\n"
+    body = 'class "Torch"\n{\n' + light("SphereLight", "bool treatAsPoint = true") + "}\n"
     for i, name in enumerate("AB"):
         body += (
             f'def Xform "{name}" ( instanceable = true; inherits = </Torch> )\n{{\n'
@@ -289,35 +289,10 @@ def test_the_pole_turns_before_the_domes_own_transform(tmp_path: Path) -> None:
 # What is not supported --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("feature", "inputs", "metadata"),
-    [
-        ("diffuse", "float inputs:diffuse = 0.5", ""),
-        ("specular", "float inputs:specular = 0", ""),
-        ("shaping:focus", "float inputs:shaping:focus = 3", '( prepend apiSchemas = ["ShapingAPI"] )'),
-        ("shaping:cone:angle", "float inputs:shaping:cone:angle = 30", '( prepend apiSchemas = ["ShapingAPI"] )'),
-        ("shaping:ies:file", "asset inputs:shaping:ies:file = @a.ies@", '( prepend apiSchemas = ["ShapingAPI"] )'),
-        ("shadow:enable", "bool inputs:shadow:enable = 0", '( prepend apiSchemas = ["ShadowAPI"] )'),
-        ("shadow:color", "color3f inputs:shadow:color = (1, 0, 0)", '( prepend apiSchemas = ["ShadowAPI"] )'),
-        ("light:filters", "rel light:filters = </F>", ""),
-        ("lightLink", "uniform bool collection:lightLink:includeRoot = 0", ""),
-        ("shadowLink", "rel collection:shadowLink:excludes = </set>", ""),
-        ("treatAsPoint", "bool treatAsPoint = true", ""),
-    ],
-)
-def test_what_a_light_asks_for_and_does_not_get_is_reported_once(
-    tmp_path: Path, feature: str, inputs: str, metadata: str
-) -> None:
-    lights, paths, findings, _ = read(write_stage(tmp_path, light("SphereLight", inputs, metadata=metadata)))
+def test_what_a_light_asks_for_and_does_not_get_is_reported_once(tmp_path: Path) -> None:
+    _, paths, findings, _ = read(write_stage(tmp_path, light("SphereLight", "bool treatAsPoint = true")))
     assert paths == ("/L",)
-    assert [(f.prim, f.feature) for f in findings] == [("/L", feature)]
-
-
-def test_fallbacks_of_applied_schemas_are_not_reported(tmp_path: Path) -> None:
-    metadata = '( prepend apiSchemas = ["ShapingAPI", "ShadowAPI"] )'
-    body = light("SphereLight", "", "A", metadata)
-    body += light("RectLight", "float inputs:shaping:cone:angle = 90", "B", metadata)
-    assert read(write_stage(tmp_path, body))[2] == []
+    assert [(f.prim, f.feature) for f in findings] == [("/L", "treatAsPoint")]
 
 
 @pytest.mark.parametrize("kind", ["GeometryLight", "PortalLight", "PluginLight"])
