@@ -4,7 +4,8 @@ They follow the same rules as gather rays and shadow rays, so that both ways of
 solving the earlier bounces agree: every reflection at a scattering surface is
 diffuse; between two of them mirrors reflect, glass bends and holes let through;
 straight from a light, glass lets ``1 - F`` through without bending it and mirrors
-block, as for shadow rays (no caustics). Edits are never seen here.
+block, as for shadow rays (no caustics). Light and shadow linking, shaping and diffuse
+multipliers of lights count. Edits are never seen here.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from icheat_usd.kernels import photons as kernels
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.tracing import straight_transmittance
 from icheat_usd.lighting import LightSampler
-from icheat_usd.materials import effective_albedo, nonzero_rows, points_on_surface, shade_hits, take_points
+from icheat_usd.lighting.controls import hidden_instances, receives, shape
+from icheat_usd.materials import (
+    concatenate_points,
+    effective_albedo,
+    nonzero_rows,
+    points_on_surface,
+    shade_hits,
+    take_points,
+)
 from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import F32, F64, I32, I64, U8, DeltaKind, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
@@ -38,7 +47,7 @@ class PhotonSettings:
     """Effort of a photon map."""
 
     n_emitted: int = 1 << 20  #: photons that leave lights
-    n_nearest: int = 80  #: photons of one density estimate
+    n_nearest: int = 200  #: photons of one density estimate
     max_radius: float = 0.1  #: of one density estimate, as a share of the scene's radius
     n_bounces: int = 16  #: diffuse reflections before the last one
     seed: int = 0
@@ -120,6 +129,7 @@ def _emit(
     lights = snapshot.lights
     origin, direction = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     power = np.zeros((count, 3), np.float32)
+    diffuse = np.float32(snapshot.controls(light).diffuse)
     if not nonzero_rows(lights.radiance[light : light + 1])[0]:
         return origin, direction, power
     if lights.kind[light] != LightKind.MESH:
@@ -128,13 +138,14 @@ def _emit(
             lights, snapshot.textures, sampler.tables, light, radius, _CLEARANCE * radius, first, total, seed,
             origin, direction, power,
         )  # fmt: skip
-        return origin, direction, power
+        shape(snapshot, light, -direction, power)
+        return origin, direction, power * diffuse
     row, barycentric, side = np.zeros(count, np.int64), np.zeros((count, 2), np.float32), np.zeros(count, np.uint8)
     kernels.emit_from_mesh(lights, sampler.tables, light, first, total, seed, row, barycentric, side, power)
     instance, triangle = lights.triangle_instance[row], lights.triangle[row]
     start = points_on_surface(snapshot, instance, triangle, barycentric, side)
     kernels.directions_from_mesh(start.normal, light, first, seed, direction)
-    return spawn_points(snapshot, start, direction), direction, power * start.emission
+    return spawn_points(snapshot, start, direction), direction, power * diffuse * start.emission
 
 
 class _Bundle:
@@ -210,31 +221,35 @@ class _Bundle:
         self.origin = spawn_points(self.snapshot, points, self.direction)
 
     def _cross(self) -> SurfacePoints:
-        """Where photons first arrive, straight from the light; what is absorbed on the way loses its power."""
-        alive = np.flatnonzero(nonzero_rows(self.power))
-        origin, direction = self.origin[alive], self.direction[alive]
-        self.photon, self.power, self.direction = self.photon[alive], self.power[alive], direction
-        points = shade_hits(self.snapshot, self.tracer.intersect(origin, direction), direction)
+        """Take the photons straight to where they arrive first, and drop those that arrive nowhere.
+
+        What does not block the light (`shadowLink`) and yet receives it stops a copy of a photon.
+        """
         passing = passing_materials(self.snapshot.materials)
         see_through = bool(passing[np.unique(self.snapshot.geometry.material)].any())
-        crossing, on = np.arange(len(alive)), points
+        hidden = hidden_instances(self.snapshot, self.light)
+        rows = np.flatnonzero(nonzero_rows(self.power))
+        origin = self.origin[rows]
+        arrived: list[tuple[I64, SurfacePoints]] = []
         for layer in range(MAX_LAYERS):
-            goes = np.zeros(len(crossing), np.bool_)
+            direction = np.ascontiguousarray(self.direction[rows])
+            points = shade_hits(self.snapshot, self.tracer.intersect(origin, direction), direction)
+            goes = np.zeros(len(rows), np.bool_)
             if see_through:
-                share = np.empty(len(crossing), np.float32)
-                straight_transmittance(on, direction, share)
-                kernels.crossings(share, self.photon[crossing], layer, self.seed, goes)
-            goes &= on.instance >= 0
-            self.power[crossing[~goes & (on.delta != DeltaKind.NONE)]] = 0
-            rows = np.flatnonzero(goes)
+                share = np.empty(len(rows), np.float32)
+                straight_transmittance(points, direction, share)
+                kernels.crossings(share, self.photon[rows], layer, self.seed, goes)
+            stays = ~goes & (points.delta == DeltaKind.NONE)
+            lit = receives(self.snapshot, self.light, points.instance)
+            stays &= (points.instance >= 0) if lit is None else lit
+            arrived.append((rows[stays], take_points(points, stays)))
+            if hidden is not None:
+                goes |= hidden[points.instance]
+            goes &= points.instance >= 0
+            rows = rows[goes]
             if not len(rows):
                 break
-            crossing, direction = crossing[rows], np.ascontiguousarray(direction[rows])
-            origin = spawn_points(self.snapshot, take_points(on, rows), direction)
-            on = shade_hits(self.snapshot, self.tracer.intersect(origin, direction), direction)
-            kept: Any
-            for kept, now in zip(points, on, strict=True):
-                kept[crossing] = now
-        else:
-            self.power[crossing] = 0
-        return points
+            origin = spawn_points(self.snapshot, take_points(points, goes), direction[goes])
+        stopped = np.concatenate([one for one, _ in arrived])
+        self.photon, self.power, self.direction = self.photon[stopped], self.power[stopped], self.direction[stopped]
+        return concatenate_points(*(points for _, points in arrived))

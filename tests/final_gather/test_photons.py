@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from icheat_usd.final_gather.photons import Photons, PhotonSettings, trace_photo
 from icheat_usd.lighting import build_light_sampler, irradiance
 from icheat_usd.materials import points_on_surface
 from icheat_usd.samples import GatherSamples, cell_direct, gather_samples, view_samples
-from icheat_usd.scene import LightKind, SceneSnapshot, SurfacePoints, Texture
+from icheat_usd.scene import LightControls, LightKind, SceneSnapshot, Shaping, SurfacePoints, Texture
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import build_bounces, solve_bounces
 from tests.scenes import (
@@ -96,6 +98,38 @@ def test_photons_bring_the_floor_what_shadow_rays_find(name: str) -> None:
     np.testing.assert_allclose(flux, exact, rtol=3 / np.sqrt(floor.sum()) + 0.004)
 
 
+@pytest.mark.parametrize("kind", ["rect", "sun", "mesh"])
+def test_photons_follow_the_controls_of_their_light(kind: str) -> None:
+    """A cone, a multiplier, a surface that is not lit and still blocks, and one that is lit and blocks nothing."""
+    lamp = {
+        "rect": Light(LightKind.RECT, (4, 2, 1), OVERHEAD @ DOWN, (0.8, 0.5)),
+        "sun": Light(LightKind.DISTANT, 9, rotation((1, 0, 0), -70), (0.4, 0)),
+    }
+    meshes = [
+        Mesh(quad(2.0), Material(0.5), path="/floor"),
+        Mesh(quad(0.5, y=0.7), Material(0.5), path="/ghost"),
+        Mesh(quad(0.4, y=0.3), Material(0.5), transforms=[translation(0.5, 0, 0.2)], path="/unlit"),
+    ]
+    if kind == "mesh":
+        meshes.append(Mesh(quad(0.5), Material(0.0, 6.0), transforms=[OVERHEAD], path="/lamp"))
+    plain = make_snapshot(meshes, lights=[lamp[kind]] if kind in lamp else [])
+    blocks, lit = np.ones((2, plain.n_instances), np.uint8)
+    blocks[1] = lit[2] = 0
+    cone = Shaping(
+        np.array([0.3, 0.7]), 2.0, np.array([0.2, 0.1, 0.9]), 0.0, np.zeros(0), np.zeros(0), np.zeros((0, 0))
+    )
+    controls = LightControls(lit, blocks, diffuse=0.4, shaping=None if kind == "mesh" else cone)
+    snapshot = replace(plain, light_controls=(controls,))
+    photons, tracer, _ = photons_of(snapshot, n_emitted=1 << 16, n_bounces=1)
+    sampler = build_light_sampler(snapshot)
+    for instance, (height, area) in enumerate(((0.0, 4.0), (0.7, 0.25), (0.3, 0.16))):
+        there = (np.abs(photons.position[:, 1] - height) < 1e-3) & (photons.normal[:, 1] > 0)
+        flux = photons.power[there].sum(axis=0, dtype=np.float64)
+        found = irradiance(snapshot, tracer, sampler, places_on(snapshot, instance, 32), 5, 64)[0]
+        np.testing.assert_allclose(flux, area * found.mean(axis=0, dtype=np.float64), rtol=0.03)
+        assert flux.any() == (instance != 2)
+
+
 def test_each_light_has_its_share_of_the_photons() -> None:
     lamps = [Light(LightKind.RECT, power, OVERHEAD @ DOWN, (0.5, 0.5)) for power in (30.0, 0.0, 1.0)]
     snapshot = make_snapshot([Mesh(quad(40.0), Material(0.5))], lights=lamps)
@@ -135,7 +169,7 @@ def test_density_gives_the_irradiance_under_a_lamp() -> None:
     height = 1.2
     lamp = Light(LightKind.DISK, 400.0, translation(0, height, 0) @ DOWN, (0.02, 0))
     snapshot = make_snapshot([Mesh(quad(2.0), Material(0.5))], lights=[lamp])
-    photons, tracer, settings = photons_of(snapshot, n_emitted=1 << 17, n_bounces=1)
+    photons, tracer, settings = photons_of(snapshot, n_emitted=1 << 17, n_bounces=1, n_nearest=80)
     places = places_on(snapshot, 0, 24)
     found = build_photon_map(snapshot, tracer, photons, settings).estimate(places.position, places.normal)[0, :, 0]
     r2 = (places.position.astype(np.float64) ** 2).sum(axis=1) + height**2
