@@ -99,15 +99,19 @@ class Pipeline:
     def final(
         self,
         *edits: Edit,
+        method: str = "brute",
         samples: int = 4,
         rays: int = 256,
         light_samples: int = 16,
         seed: int = 0,
+        edge_samples: int = 0,
         extras: Extras = NO_EXTRAS,
     ) -> FinalGather:
-        settings = GatherSettings(samples, rays, light_samples, self.n_bounces, seed, method="brute")
+        settings = GatherSettings(
+            samples, rays, light_samples, self.n_bounces, seed, method=method, edge_samples=edge_samples
+        )
         field = self.field(*edits)
-        needs = field.uses_incident or field.has_offset
+        needs = method == "cached" or field.uses_incident or field.has_offset
         return final_gather(
             self.snapshot,
             self.tracer,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.edits.offsets import offset_radiance
-from icheat_usd.final_gather.edited_records import MOST_SOFT, EditedRecords, soft_masks
+from icheat_usd.final_gather.edited_records import MOST_SOFT, EditedRecords, RecordPairs, soft_masks
 from icheat_usd.final_gather.gatherer import (
     GatheredLight,
     Gatherer,
@@ -18,6 +18,7 @@ from icheat_usd.final_gather.gatherer import (
     touched_receivers,
 )
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, Places
+from icheat_usd.final_gather.record_rays import RecordRays, take_rays
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
@@ -48,17 +49,17 @@ class CachedGather:
         found = self._cache.find(position, normal)
         irradiance = np.maximum(self._cache.interpolate(found, position, normal), np.float32(0))
         # What the coarser look at the scene has missed, less than a pixel wide, is gathered where it is.
-        alone = np.flatnonzero(found.number == 0)
+        alone, own_rays = np.flatnonzero(found.number == 0), None
         if len(alone):
-            rays = self._cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone])
-            irradiance[alone] = np.pi * rays.radiance(self._cache.cells).mean(axis=1)
+            own_rays = self._cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone])
+            irradiance[alone] = np.pi * own_rays.radiance(self._cache.cells).mean(axis=1)
         base = (points.albedo * (irradiance * _INVERSE_PI)).astype(np.float32, copy=False)
         shiny = specular_lobe(self._gatherer, points, to_eye, stream, self._glossy_rays, seed)
         if shiny is not None:
             base[shiny.where] += shiny.mean()
         if not self._stacks:
             return GatheredLight(base, base.copy())
-        sample = _Sampled(points, stream, seed, found, base, shiny)
+        sample = _Sampled(points, stream, seed, found, base, shiny, alone, own_rays)
         *steps, edited = (_under_stack(stack, records, sample) for stack, records in self._stacks)
         return GatheredLight(base, edited, tuple(steps))
 
@@ -72,6 +73,8 @@ class _Sampled(NamedTuple):
     found: Lookup
     base: F32
     shiny: Lobe | None
+    alone: I64  #: (k,) ascending, samples without records
+    own_rays: RecordRays | None  #: of these
 
 
 def _under_stack(g: Gatherer, records: EditedRecords, sampled: _Sampled) -> F32:
@@ -82,7 +85,8 @@ def _under_stack(g: Gatherer, records: EditedRecords, sampled: _Sampled) -> F32:
         return edited
     # Curves, light from behind occluders, and mixtures of too many soft masks look at pairs of their own; the
     # cache corrects what their few rays brought.
-    by_pairs = (soft_masks(receivers.masks) > MOST_SOFT) | (sampled.found.number[touched] == 0)
+    has_records = sampled.found.number[touched] > 0
+    by_pairs = has_records & (soft_masks(receivers.masks) > MOST_SOFT)
     if g.field.aggregates or g.field.throughs:
         by_pairs[:] = True
     lobes = [] if shiny is None else [shiny]
@@ -97,8 +101,17 @@ def _under_stack(g: Gatherer, records: EditedRecords, sampled: _Sampled) -> F32:
     rest = np.flatnonzero(~by_pairs)
     if len(rest):
         where, some = touched[rest], receivers.take(rest)
-        found = sampled.found.take(where)
-        change = records.change(found, points.position[where], points.shading_normal[where], some.masks)
+        change = np.empty((len(rest), 3), np.float32)
+        near = np.flatnonzero(has_records[rest])
+        at = where[near]
+        change[near] = records.change(
+            sampled.found.take(at), points.position[at], points.shading_normal[at], some.masks[:, near]
+        )
+        lost = np.flatnonzero(~has_records[rest])
+        if len(lost) and sampled.own_rays is not None:
+            rows = np.searchsorted(sampled.alone, where[lost])
+            pairs = RecordPairs(g, take_rays(sampled.own_rays, rows), take_points(points, where[lost]))
+            change[lost] = np.pi * pairs.change(np.arange(len(lost)), some.masks[:, lost]).mean(axis=1)
         light[rest] = base[where] + points.albedo[where] * (change * _INVERSE_PI)
         if shiny is not None:
             reflected = light_of_pairs(g, some, where, lobes, points.albedo, with_offsets=False)

@@ -13,6 +13,7 @@ import numpy as np
 
 from icheat_usd.edits.bound import Ends
 from icheat_usd.edits.field import EditField
+from icheat_usd.edits.operations import PairEnd
 from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, RecordValues
 from icheat_usd.final_gather.record_rays import RecordRays, take_rays
@@ -22,6 +23,7 @@ from icheat_usd.scene import F32, I64, Bool, SurfacePoints
 #: Masks of one receiver between 0 and 1; with more, mixtures would be of more than 16 sets.
 MOST_SOFT = 4
 _RAYS_AT_ONCE = 1 << 18
+_STEP = 0.1  # of a record's reach, or radians: from how far beside a record a receiver's own part is looked at
 
 
 class EditedRecords:
@@ -87,54 +89,103 @@ class EditedRecords:
         at_once = max(1, _RAYS_AT_ONCE // rays.n_rays)
         for begin in range(0, len(records), at_once):
             chunk = records[begin : begin + at_once]
-            pairs = _RecordPairs(self._gatherer, take_rays(rays, chunk), take_points(cache.points, chunk))
+            pairs = RecordPairs(self._gatherer, take_rays(rays, chunk), take_points(cache.points, chunk))
             for is_in, slots, needed in missing:
                 rows = np.flatnonzero(needed[chunk])
                 if len(rows) == 0:
                     continue
-                brought = pairs.change(rows, is_in)
-                values, _ = self._cache.sums(take_rays(pairs.rays, rows), brought)
+                values = pairs.values(rows, chunk[rows], is_in, cache)
                 slots[chunk[rows]] = n + np.arange(len(rows), dtype=np.int32)
                 n += len(rows)
                 parts.append(values)
         self._values = RecordValues(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-class _RecordPairs:
+class RecordPairs:
     """Rays of some records as pairs of their places and the casters that they end on."""
 
     def __init__(self, gatherer: Gatherer, rays: RecordRays, points: SurfacePoints) -> None:
         self._field = gatherer.field
         assert gatherer.solution is not None
-        self.rays = rays
+        self._rays = rays
         self._flat = np.flatnonzero(rays.cell.reshape(-1) >= 0)
         self._casters = self._field.casters(rays.ends(gatherer.snapshot, self._flat))
         self._receivers = self._field.receivers(points)
+        self._located = _is_located(self._receivers, self._field)
         self._b = gatherer.solution.b
 
-    def change(self, rows: I64, is_in: Bool) -> F32:
-        """Change of the light that rays of records `rows` bring, (n, n_rays, 3), where receivers are in these edits."""
-        n_rays = self.rays.n_rays
-        inside = np.zeros(len(self.rays.stream), bool)
+    def values(self, rows: I64, records: I64, is_in: Bool, cache: IrradianceCache) -> RecordValues:
+        """Changes of the irradiance of records `rows`, where receivers are in these edits, and their gradients.
+
+        `records` are their numbers in the cache.
+        """
+        masks = np.repeat(is_in.astype(np.float32)[:, None], len(self._rays.stream), axis=1)
+        some = take_rays(self._rays, rows)
+        values, _ = cache.sums(some, self.change(rows, masks))
+        values.by_move[...] *= np.take(cache.shrink, records)[:, None, None]
+        if not self._field.uses_receiver:
+            return values
+        # The gradients of hemispheres take what a pair brings as given. What it depends on the receiver is added, by
+        # looking from beside it, and from a turned surface, at the same casters.
+        place = self._receivers.place
+        assert place is not None
+        normal = place.normal
+        axis = np.eye(3, dtype=np.float32)[np.argmin(np.abs(normal), axis=1)]
+        first = np.cross(axis, normal)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        second = np.cross(normal, first)
+        step = _STEP * np.take(cache.table.reach, records)[:, None]
+        for tangent, axis in ((first, second), (second, -first)):
+            moved: F32 = place.position + _spread(step, rows, len(normal)) * tangent
+            turned: F32 = normal + np.float32(_STEP) * tangent
+            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+            for there, gradient, direction, size in (
+                (place._replace(position=moved), values.by_move, tangent, step),
+                (place._replace(normal=turned), values.by_turn, axis, np.float32(_STEP)),
+            ):
+                light, _ = cache.sums(some, self.change(rows, masks, there))
+                slope = (light.irradiance - values.irradiance) / size
+                gradient += slope[:, :, None] * direction[rows][:, None, :]
+        return values
+
+    def change(self, rows: I64, masks: F32, place: PairEnd | None = None) -> F32:
+        """Change of the light that rays of records `rows` bring, (k, n_rays, 3).
+
+        Parameters
+        ----------
+        masks : (n_rows, n) float32
+            Of all records as receivers.
+        place : PairEnd, optional
+            Where the receivers are taken to be.
+        """
+        rays = self._rays
+        inside = np.zeros(len(rays.stream), bool)
         inside[rows] = True
-        row = self._flat // n_rays
-        touched = np.flatnonzero(inside[row] & (self._casters.masks[is_in] != 0).any(axis=0))
-        out = np.zeros((len(self.rays.stream), n_rays, 3), np.float32)
+        row = self._flat // rays.n_rays
+        reached = inside[row] & ((masks != 0)[:, row] & (self._casters.masks != 0)).any(axis=0)
+        touched = np.flatnonzero(reached)
+        out = np.zeros((len(rays.stream), rays.n_rays, 3), np.float32)
         if len(touched):
             flat = self._flat[touched]
-            masks = np.repeat(is_in.astype(np.float32)[:, None], len(inside), axis=1)
-            masks *= _is_located(self._receivers, self._field)
-            receivers = self._receivers._replace(masks=masks).take(row[touched])
-            seen = np.take(self._b, np.take(self.rays.cell.reshape(-1), flat), axis=1)
-            found = self._field.evaluate(seen, receivers, self._casters.take(touched))
+            receivers = self._receivers._replace(masks=masks * self._located)
+            if place is not None:
+                receivers = receivers._replace(place=place)
+            seen = np.take(self._b, np.take(rays.cell.reshape(-1), flat), axis=1)
+            found = self._field.evaluate(seen, receivers.take(row[touched]), self._casters.take(touched))
             changed = found.light(seen) - seen.sum(axis=0)
-            if len(self.rays.detour):
-                place = np.searchsorted(self.rays.detour, flat)
-                place = np.minimum(place, len(self.rays.detour) - 1)
-                went = self.rays.detour[place] == flat
-                changed[went] *= self.rays.throughput[place[went]]
+            if len(rays.detour):
+                entry = np.minimum(np.searchsorted(rays.detour, flat), len(rays.detour) - 1)
+                went = rays.detour[entry] == flat
+                changed[went] *= rays.throughput[entry[went]]
             out.reshape(-1, 3)[flat] = changed
         return out[rows]
+
+
+def _spread(values: F32, rows: I64, n: int) -> F32:
+    """(k, 1) values of some rows among n, 0 elsewhere."""
+    out = np.zeros((n, 1), np.float32)
+    out[rows] = values
+    return out
 
 
 def _is_located(receivers: Ends, field: EditField) -> F32:

@@ -26,6 +26,7 @@ class GatherSolution:
 
     gather: GatherSamples
     b: F32  #: (G, n_gather, 3) by group of lights
+    total: F32  #: (n_gather, 3) of all lights; its last bits do not depend on the groups
     offsets: OffsetCasters | None
 
     def at(self, points: SurfacePoints) -> F32:
@@ -128,8 +129,9 @@ def _lit(gatherer: Gatherer, where: I64, rays: GatherRays, tint: F32, seed: int)
 def _reflected(gatherer: Gatherer, points: SurfacePoints, throughput: F32, seed: int) -> Reflected:
     if not gatherer.follows_paths:
         assert gatherer.solution is not None
-        by_group = gatherer.solution.at(points) * throughput
-        return Reflected(by_group.sum(axis=0), by_group)
+        cell = gatherer.solution.gather.locate(points)
+        by_group = np.take(gatherer.solution.b, cell, axis=1) * throughput
+        return Reflected(np.take(gatherer.solution.total, cell, axis=0) * throughput, by_group)
     return reflected_radiance(
         gatherer.snapshot,
         gatherer.tracer,

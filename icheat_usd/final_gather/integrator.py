@@ -176,7 +176,7 @@ def _cached(
     """Place all records, by the camera samples that every pixel has."""
     assert gatherer.solution is not None
     snapshot = gatherer.snapshot
-    cells = np.concatenate([gatherer.solution.b.sum(axis=0), np.zeros((1, 3), np.float32)])
+    cells = np.concatenate([gatherer.solution.total, np.zeros((1, 3), np.float32)])
     n_theta, n_phi, seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(settings.seed, 0xCAC4E))
     tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, seed)
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=not gatherer.field.is_identity)
@@ -221,7 +221,8 @@ def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | N
     if gather is None or per_light is None:
         return None
     b = sum_groups(per_light, field.light_group, field.n_groups)
-    return GatherSolution(gather, b, offset_casters(field, field.casters(gather.points), b, gather.area))
+    total = per_light.sum(axis=0, dtype=np.float32)
+    return GatherSolution(gather, b, total, offset_casters(field, field.casters(gather.points), b, gather.area))
 
 
 def _band(

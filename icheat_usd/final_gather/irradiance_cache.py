@@ -97,6 +97,7 @@ class IrradianceCache:
     is_kept: bool = False  #: whether rays are kept, so that edits can look at them
     table: kernels.RecordTable = field(init=False)
     values: RecordValues = field(init=False)
+    shrink: F32 = field(default_factory=lambda: np.empty(0, np.float32))  #: (n,) what `by_move` was multiplied with
     _points: list[SurfacePoints] = field(default_factory=list)
     _rays: list[RecordRays] = field(default_factory=list)
     _least: F32 = field(init=False)
@@ -223,6 +224,7 @@ class IrradianceCache:
         # A gradient that holds for `reach` says nothing further out.
         shrink = np.minimum(1.0, np.maximum(reach, 1e-30) / wide).astype(np.float32)
         values.by_move[...] *= shrink[:, None, None]
+        self.shrink = np.concatenate([self.shrink, shrink])
         turn = np.full(len(extent), 1.0 - np.cos(np.radians(settings.most_turn)), np.float32)
         trust = np.clip(spread[:, 1] / (_CREASE * extent), _LEAST_TRUST, 1.0).astype(np.float32)
         table = kernels.RecordTable(
