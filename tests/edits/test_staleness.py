@@ -13,7 +13,8 @@ from icheat_usd.edits import operations, staleness
 from icheat_usd.edits.facts import MAX_SURFACES, facts
 from icheat_usd.edits.model import Edit, Payload, Region, Selection, Shape
 from icheat_usd.edits.staleness import Aspect, changes, needs, stale_because
-from icheat_usd.scene import LightKind, SceneSnapshot
+from icheat_usd.scene import PLAIN, LightControls, LightKind, SceneSnapshot
+from tests.lighting.test_controls import EVEN
 from tests.scenes import Light, Material, Mesh, box, cornell, look_at, make_snapshot, quad, rotation, translation
 
 WHITE = Material(0.7)
@@ -81,6 +82,20 @@ def test_a_change_is_said_in_an_artists_words(change: dict[str, Any], expected: 
 def test_a_colour_is_told_from_brightness() -> None:
     found = texts(room(), room(colour=(1.0, 0.5, 0.2)))
     assert found == ["light Key got dimmer (0.585 times)", "light Key has another colour"]
+
+
+def test_other_links_and_shaping_are_noticed_under_any_name() -> None:
+    def linked(out: str, prefix: str = "/World", **controls: Any) -> SceneSnapshot:
+        plain = room(prefix=prefix)
+        receivers = np.array([surface.path != f"{prefix}/{out}" for surface in plain.surfaces], np.uint8)
+        controls = {"receivers": None if receivers.all() else receivers} | controls
+        return dataclasses.replace(plain, light_controls=(LightControls(**controls), PLAIN))
+
+    said = ["light Key has another texture, other links or other shaping"]
+    assert texts(room(), linked("Block")) == texts(linked("Block"), linked("Floor")) == said
+    assert texts(room(), linked("", specular=0.5)) == said
+    assert texts(room(), linked("", shaping=EVEN._replace(focus=2.0))) == said
+    assert texts(linked("Block"), linked("Block", "/Show"), ("/World", "/Show")) == []
 
 
 def test_what_goes_is_named() -> None:

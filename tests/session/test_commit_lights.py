@@ -12,6 +12,7 @@ from icheat_usd.errors import EditError
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.session import Quality, Session
 from icheat_usd.session.commit_lights import write_lights
+from icheat_usd.session.content_keys import digest
 from icheat_usd.session.light_changes import all_lights, changed_light, new_light, read_image
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_state import UNCHANGED, LiveState
@@ -143,6 +144,26 @@ def test_every_kind_of_change_of_every_kind_of_light_is_read_back(tmp_path: Path
     assert about["why"] == "test" and about["who"] and about["when"].startswith("20")
     sphere = stage.GetRootLayer().GetPrimAtPath("/World/Rig/Sphere")
     assert {"inputs:intensity", "inputs:radius"} == set(sphere.properties.keys()), "dimming writes intensity alone"
+
+
+def test_links_multipliers_and_shaping_outlive_a_commit(tmp_path: Path) -> None:
+    path = tmp_path / "shot.usda"
+    opinions = """def RectLight "Rect" ( prepend apiSchemas = ["ShapingAPI"] )
+        {
+            float inputs:specular = 0.5
+            float inputs:shaping:cone:angle = 50
+            rel collection:lightLink:excludes = </World/Room>
+    """
+    path.write_text(STAGE.replace('def RectLight "Rect"\n        {', opinions))
+    session = Session.open(path, width=8, height=6)
+    snapshot = session.snapshot
+    before = snapshot.controls(snapshot.light_paths.index("/World/Rig/Rect"))
+    assert before.specular == 0.5 and before.shaping is not None and before.receivers is not None
+    state = changed(snapshot, UNCHANGED, "Rect", move=(0.1, 0.2, -0.3), turn=((0, 1, 0), 30), size=(80, 10), gain=2.0)
+    assert write_lights(session.stage, snapshot, state, layer="shot.usda", frame=None, why="") == ()
+    again = Session.open(path, width=8, height=6).snapshot
+    after = again.controls(again.light_paths.index("/World/Rig/Rect"))
+    assert digest(after) == digest(before) and not np.array_equal(again.lights.to_world, snapshot.lights.to_world)
 
 
 def test_a_removed_light_is_deactivated_and_can_be_activated_again(tmp_path: Path) -> None:

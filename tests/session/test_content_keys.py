@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import icheat_usd
-from icheat_usd.scene import LightKind, SceneSnapshot
+from icheat_usd.scene import LightControls, LightKind, SceneSnapshot, Shaping
 from icheat_usd.session import content_keys
 from icheat_usd.session.content_keys import ShotKeys, code_digest, code_files, digest, shot_keys
 from icheat_usd.session.quality import Quality
@@ -58,6 +58,23 @@ def test_the_sky_is_part_of_the_view_and_of_no_row() -> None:
     base = snapshot()
     textures = base.textures._replace(texels=base.textures.texels * np.float32(2))
     assert changed(replace(base, textures=textures)) == {"lights", "cell_light", "view_light", "view"}
+
+
+@pytest.mark.parametrize(
+    "controls",
+    [
+        LightControls(receivers=np.zeros(1, np.uint8)),
+        LightControls(blockers=np.zeros(1, np.uint8)),
+        LightControls(diffuse=0.5),
+        LightControls(specular=0.5),
+        LightControls(shaping=Shaping(np.ones(2), 0.0, np.zeros(3), 0.0, np.zeros(0), np.zeros(0), np.zeros((0, 0)))),
+    ],
+)
+def test_controls_of_a_light_cost_light_alone(controls: LightControls) -> None:
+    of = {"lights", "cell_light", "view_light"}
+    linked = replace(snapshot(), light_controls=(LightControls(), controls))
+    assert changed(linked) == of
+    assert shot_keys(linked, QUALITY, "embree") == shot_keys(linked, QUALITY, "embree")
 
 
 def test_a_camera_that_moves_leaves_the_scene() -> None:
