@@ -8,9 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.final_gather.settings import GatherSettings
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.samples import ViewSamples, view_samples
 from icheat_usd.samples.adaptive import edge_pixels, join_looks, look_over
+from icheat_usd.samples.pixel_filter import PixelFilter
 from icheat_usd.samples.view import SkyPaths
 from icheat_usd.scene import I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -31,13 +33,18 @@ class CameraPass:
 
     Parameters
     ----------
+    n_edge : int
+        More samples of pixels with edges.
     band : int
         Samples per band, about.
     """
 
-    def __init__(self, snapshot: SceneSnapshot, tracer: Tracer, n: int, n_edge: int, seed: int, band: int) -> None:
-        self._snapshot, self._tracer = snapshot, tracer
-        self._n, self._n_edge, self._seed = n, n_edge, seed
+    def __init__(
+        self, snapshot: SceneSnapshot, tracer: Tracer, settings: GatherSettings, n_edge: int, band: int
+    ) -> None:
+        self._snapshot, self._tracer, self._settings = snapshot, tracer, settings
+        self._n, self._n_edge, n = settings.samples_per_pixel, n_edge, settings.samples_per_pixel
+        self._filter = PixelFilter(settings.pixel_filter, settings.filter_width)
         camera = snapshot.camera
         n_pixels = camera.width * camera.height
         pixels = max(1, band // n)
@@ -76,9 +83,10 @@ class CameraPass:
             self._snapshot,
             self._tracer,
             samples_per_pixel=n,
-            first_sample=first,
-            centred=False if self._n + self._n_edge > 1 else None,
-            seed=self._seed,
+            first_sample=first + (self._settings.first_sample or 0),
+            centred=self._settings.first_sample is None and self._n + self._n_edge == 1,
+            pixel_filter=self._filter,
+            seed=self._settings.seed,
             max_splits=0,
             pixels=pixels,
         )
@@ -98,8 +106,6 @@ def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> ViewSamples:
     def both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.concatenate([a, b])[order])
 
-    assert view.sky is not None
-    assert more.sky is not None
     sky = SkyPaths(
         np.concatenate([view.sky.pixel, more.sky.pixel]),
         np.concatenate([view.sky.throughput * scale[view.sky.pixel, None], more.sky.throughput * rest]),
@@ -115,5 +121,6 @@ def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> ViewSamples:
         to_eye=both(view.to_eye, more.to_eye),
         depth=both(view.depth, more.depth),
         background=background,
+        stream=both(view.stream, more.stream),
         sky=sky,
     )

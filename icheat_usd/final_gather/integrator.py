@@ -146,14 +146,15 @@ def final_gather(
         gatherer = with_prefixes(gatherer)
     band = SAMPLES_AT_ONCE if is_cached else max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
     n_edge = settings.edge_samples if is_cached else 0
-    camera = CameraPass(snapshot, tracer, settings.samples_per_pixel, n_edge, settings.seed, band)
+    camera = CameraPass(snapshot, tracer, settings, n_edge, band)
     find: FindLight = partial(_followed, gatherer)
     if is_cached and gather is not None:
         find = _cached(gatherer, gather, camera, settings, progress).light
+    seed = settings.seed if settings.first_sample is None else int(hash_combine(settings.seed, settings.first_sample))
     bands: list[_Band] = []
     for number, (pixels, view) in enumerate(camera.all()):
         progress("gather", number / len(camera.bands))
-        own_seed = int(hash_combine(settings.seed, pixels[0]))
+        own_seed = int(hash_combine(seed, pixels[0]))
         bands.append(_band(gatherer, find, view, settings, pixels, own_seed, extras))
     progress("gather", 1.0)
     shape = (snapshot.camera.height, snapshot.camera.width, -1)

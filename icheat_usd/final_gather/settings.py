@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from icheat_usd.final_gather.irradiance_cache import CacheSettings
+from icheat_usd.samples.pixel_filter import PixelFilter
 
 METHODS = ("cached", "brute")
 
@@ -15,7 +16,7 @@ class GatherSettings:
 
     Raises
     ------
-    ValueError
+    ValueError, SettingsError
         A value makes no sense.
     """
 
@@ -31,9 +32,15 @@ class GatherSettings:
     edge_samples: int = 12  #: more camera samples in pixels that hold edges of the picture
     glossy_rays: int = 16  #: per camera sample of a glossy surface, where diffuse light is cached
     cache: CacheSettings = field(default_factory=CacheSettings)
+    pixel_filter: str = "box"  #: or "triangle", "gaussian", "blackman-harris"
+    filter_width: float = 0.0  #: of its support, pixels; 0 is the usual width of each filter
+    #: Number of a pixel's first camera sample, where this image is to be one of several that are added up; None where
+    #: it stands alone.
+    first_sample: int | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method '{self.method}' is none of {', '.join(METHODS)}")
         if self.samples_per_pixel < 1 or self.edge_samples < 0:
             raise ValueError("samples_per_pixel is at least 1, and edge_samples at least 0")
+        PixelFilter(self.pixel_filter, self.filter_width)
