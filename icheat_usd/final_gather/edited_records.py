@@ -136,8 +136,8 @@ class RecordPairs:
         second = np.cross(normal, first)
         step = _STEP * np.take(cache.table.reach, records)[:, None]
         for tangent, axis in ((first, second), (second, -first)):
-            moved: F32 = place.position + _spread(step, rows, len(normal)) * tangent
-            turned: F32 = normal + np.float32(_STEP) * tangent
+            moved = (place.position + _spread(step, rows, len(normal)) * tangent).astype(np.float32)
+            turned = (normal + np.float32(_STEP) * tangent).astype(np.float32)
             turned /= np.linalg.norm(turned, axis=1, keepdims=True)
             for there, gradient, direction, size in (
                 (place._replace(position=moved), values.by_move, tangent, step),

@@ -98,39 +98,43 @@ def _sums_of_record(  # type: ignore[no-untyped-def]
                 nearest = min(nearest, d)
     spread[r, 0] = m * n / closeness if closeness > 0.0 else np.inf
     spread[r, 1] = nearest
+    slope, low, width = np.empty(m), np.empty(m), np.empty(m)
+    for j in range(m):
+        u = (j + 0.5) / m
+        slope[j] = np.sqrt(u / (1.0 - u))
+        low[j] = (1.0 - j / m) * np.sqrt(j / m) * (2.0 * np.pi / n)
+        width[j] = np.sqrt((j + 1) / m) - np.sqrt(j / m)
+    total, turn, move = np.zeros(n_channels), np.zeros((n_channels, 2)), np.zeros((n_channels, 2))
+    for k in range(n):
+        phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
+        edge = 2.0 * np.pi * (k / n + first_turn)
+        across, along = np.cos(phi), np.sin(phi)
+        edge_across, edge_along = np.cos(edge), np.sin(edge)
+        before = k - 1 if k > 0 else n - 1
+        for j in range(m):
+            ray, beside, inside = j * n + k, j * n + before, max(j - 1, 0) * n + k
+            d = distance[r, ray]
+            outwards = low[j] / max(min(d, distance[r, inside]), _TOUCHING)
+            around = width[j] / max(min(d, distance[r, beside]), _TOUCHING)
+            for c in range(n_channels):
+                value = np.float64(radiance[r, ray, c])
+                total[c] += value
+                turn[c, 0] -= along * slope[j] * value
+                turn[c, 1] += across * slope[j] * value
+                out = outwards * (value - radiance[r, inside, c])
+                turned = around * (value - radiance[r, beside, c])
+                move[c, 0] += across * out - edge_along * turned
+                move[c, 1] += along * out + edge_across * turned
+    share = np.pi / (m * n)
     for c in range(n_channels):
-        total = 0.0
-        turn_a, turn_b, move_a, move_b = 0.0, 0.0, 0.0, 0.0
-        for k in range(n):
-            phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
-            edge = 2.0 * np.pi * (k / n + first_turn)
-            before = k - 1 if k > 0 else n - 1
-            by_tangent, outwards, around = 0.0, 0.0, 0.0
-            for j in range(m):
-                value = radiance[r, j * n + k, c]
-                total += value
-                u = (j + 0.5) / m
-                by_tangent += np.sqrt(u / (1.0 - u)) * value
-                d = distance[r, j * n + k]
-                if j > 0:
-                    nearer = max(min(d, distance[r, (j - 1) * n + k]), _TOUCHING)
-                    low = j / m
-                    outwards += (1.0 - low) * np.sqrt(low) / nearer * (value - radiance[r, (j - 1) * n + k, c])
-                nearer = max(min(d, distance[r, j * n + before]), _TOUCHING)
-                width = np.sqrt((j + 1) / m) - np.sqrt(j / m)
-                around += width / nearer * (value - radiance[r, j * n + before, c])
-            turn_a -= np.sin(phi) * by_tangent
-            turn_b += np.cos(phi) * by_tangent
-            move_a += np.cos(phi) * outwards * (2.0 * np.pi / n) - np.sin(edge) * around
-            move_b += np.sin(phi) * outwards * (2.0 * np.pi / n) + np.cos(edge) * around
-        share = np.pi / (m * n)
-        irradiance[r, c] = share * total
-        by_turn[r, c, 0] = share * (turn_a * tx + turn_b * bx)
-        by_turn[r, c, 1] = share * (turn_a * ty + turn_b * by)
-        by_turn[r, c, 2] = share * (turn_a * tz + turn_b * bz)
-        by_move[r, c, 0] = move_a * tx + move_b * bx
-        by_move[r, c, 1] = move_a * ty + move_b * by
-        by_move[r, c, 2] = move_a * tz + move_b * bz
+        irradiance[r, c] = share * total[c]
+        a, b = share * turn[c, 0], share * turn[c, 1]
+        by_turn[r, c, 0] = a * tx + b * bx
+        by_turn[r, c, 1] = a * ty + b * by
+        by_turn[r, c, 2] = a * tz + b * bz
+        by_move[r, c, 0] = move[c, 0] * tx + move[c, 1] * bx
+        by_move[r, c, 1] = move[c, 0] * ty + move[c, 1] * by
+        by_move[r, c, 2] = move[c, 0] * tz + move[c, 1] * bz
 
 
 @parallel_kernel

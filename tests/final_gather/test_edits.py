@@ -16,6 +16,7 @@ import pytest
 
 from icheat_usd.edits.model import Edit, KeyedPayload, MaskedSurface, Payload, SurfaceMask, Value
 from icheat_usd.final_gather import FinalGather
+from icheat_usd.final_gather.settings import METHODS
 from icheat_usd.samples import view_samples
 from tests import naive
 from tests.agreement import Agreement, compare
@@ -75,9 +76,9 @@ def relit_differences(name: str) -> list[np.ndarray]:
 
 
 @functools.cache
-def final_differences(name: str) -> list[np.ndarray]:
-    pipeline = previews()[0]
-    finals = [pipeline.final(*STACKS[name], samples=16, rays=16, light_samples=1, seed=seed) for seed in range(4)]
+def final_differences(name: str, method: str) -> list[np.ndarray]:
+    pipeline, counts = previews()[0], {"samples": 16, "rays": 16, "light_samples": 1}
+    finals = [pipeline.final(*STACKS[name], method=method, seed=seed, **counts) for seed in range(4)]
     return [final.indirect_edited - final.indirect for final in finals]
 
 
@@ -88,10 +89,11 @@ def assert_agree(found: Agreement, slack: float) -> None:
     assert found.blocks < 2.4, found
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", STACKS)
-def test_differences_that_edits_make_are_those_of_the_relighter(name):
+def test_differences_that_edits_make_are_those_of_the_relighter(name, method):
     """Cells are 5 cm across in a box of 2 m: 3 % of tolerance for the light of a place, 2 % in the mean."""
-    assert_agree(compare(relit_differences(name), final_differences(name), tolerance=0.03), 0.02)
+    assert_agree(compare(relit_differences(name), final_differences(name, method), tolerance=0.03), 0.02)
 
 
 @pytest.mark.parametrize("name", [name for name in STACKS if "hsv" not in name and "soft" not in name])
@@ -119,10 +121,10 @@ def test_differences_that_scales_make_are_those_of_a_plain_renderer(name):
     assert_agree(found, 0.002)
 
 
-def render(*edits: Edit, threads: int = 2) -> FinalGather:
+def render(*edits: Edit, threads: int = 2, method: str = "brute") -> FinalGather:
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
     try:
-        return previews()[0].final(*edits, samples=4, rays=16, light_samples=4)
+        return previews()[0].final(*edits, method=method, samples=4, rays=16, light_samples=4)
     finally:
         numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
 
@@ -136,9 +138,10 @@ def touched_pixels(edit: Edit) -> np.ndarray:
     return np.bincount(view.pixel, inside, camera.width * camera.height).reshape(camera.height, camera.width) > 0
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("edit", [BLEED, TURN, painted("scale", {"gain": 4.0})], ids=["scale", "hsv", "soft"])
-def test_pixels_outside_the_receivers_keep_their_bits(edit):
-    plain, edited = render(), render(edit)
+def test_pixels_outside_the_receivers_keep_their_bits(edit, method):
+    plain, edited = render(method=method), render(edit, method=method)
     for layer in ("direct", "indirect", "emission", "background", "albedo"):
         np.testing.assert_array_equal(getattr(edited, layer), getattr(plain, layer))
     inside = touched_pixels(edit)
@@ -148,9 +151,10 @@ def test_pixels_outside_the_receivers_keep_their_bits(edit):
     assert 0.05 < inside.mean() < 0.95
 
 
-def test_an_edit_that_changes_a_fifth_of_the_picture_by_a_twentieth_stays_inside_its_receivers():
+@pytest.mark.parametrize("method", METHODS)
+def test_an_edit_that_changes_a_fifth_of_the_picture_by_a_twentieth_stays_inside_its_receivers(method):
     strong = Edit("/strong", "scale", {"gain": 2.0}, WHITE, EVERYTHING)
-    plain, edited = render(), render(strong)
+    plain, edited = render(method=method), render(strong, method=method)
     before = plain.direct + plain.emission + plain.indirect
     after = edited.direct + edited.emission + edited.indirect_edited
     relative = np.abs(after - before).max(axis=-1) / np.maximum(before.max(axis=-1), 1e-6)
@@ -160,27 +164,30 @@ def test_an_edit_that_changes_a_fifth_of_the_picture_by_a_twentieth_stays_inside
     np.testing.assert_array_equal(after[outside], before[outside])
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("threads", [1, 2])
-def test_no_edit_muted_edit_and_amount_zero_are_the_unedited_image_bit_for_bit(threads):
-    plain = render()
+def test_no_edit_muted_edit_and_amount_zero_are_the_unedited_image_bit_for_bit(threads, method):
+    plain = render(method=method)
     np.testing.assert_array_equal(plain.indirect_edited, plain.indirect)
     for edit in (
         Edit("/e", "scale", {"gain": 3.0}, WHITE, EVERYTHING, enabled=False),
         Edit("/e", "hsv", {"hue": 90.0}, WHITE, EVERYTHING, amount=0.0),
         Edit("/e", "scale", {"gain": 3.0}, select("/nothing"), EVERYTHING),
     ):
-        same = render(edit, threads=threads)
+        same = render(edit, threads=threads, method=method)
         np.testing.assert_array_equal(same.indirect_edited, plain.indirect)
         np.testing.assert_array_equal(same.indirect, plain.indirect)
         np.testing.assert_array_equal(same.direct, plain.direct)
 
 
-def test_the_same_bits_on_one_thread_and_on_two():
-    one, two = render(BLEED, TURN, threads=1), render(BLEED, TURN, threads=2)
+@pytest.mark.parametrize("method", METHODS)
+def test_the_same_bits_on_one_thread_and_on_two(method):
+    one, two = render(BLEED, TURN, threads=1, method=method), render(BLEED, TURN, threads=2, method=method)
     for layer in ("background", "emission", "direct", "indirect", "indirect_edited", "albedo", "normal", "depth"):
         np.testing.assert_array_equal(getattr(one, layer), getattr(two, layer))
 
 
-def test_scaling_everything_scales_the_indirect_image():
-    final = render(Edit("/e", "scale", {"gain": 2.5}, EVERYTHING, EVERYTHING))
+@pytest.mark.parametrize("method", METHODS)
+def test_scaling_everything_scales_the_indirect_image(method):
+    final = render(Edit("/e", "scale", {"gain": 2.5}, EVERYTHING, EVERYTHING), method=method)
     np.testing.assert_allclose(final.indirect_edited, 2.5 * final.indirect, rtol=1e-5)

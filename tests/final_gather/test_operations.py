@@ -10,6 +10,7 @@ import pytest
 
 from icheat_usd.edits.encodings.bake import bake_field
 from icheat_usd.edits.model import Edit, KeyedPayload, Payload
+from icheat_usd.final_gather.settings import METHODS
 from icheat_usd.relight import Relighter
 from icheat_usd.scene import LightKind, SceneSnapshot
 from icheat_usd.tracing import build_tracer
@@ -38,7 +39,7 @@ def edit(operation: str, receivers=WHITE, casters=EVERYTHING, **values) -> Edit:
     return Edit(f"/{operation}", operation, PARAMETERS[operation], receivers, casters, **values)
 
 
-def assert_both_renderers_agree(pipelines: list[Pipeline], edits: tuple[Edit, ...]) -> None:
+def assert_both_renderers_agree(pipelines: list[Pipeline], edits: tuple[Edit, ...], method: str = "brute") -> None:
     """Differences that the edits make are compared; the cells of the relighter are 5 cm across in a box of 2 m."""
     relit = []
     for pipeline in pipelines:
@@ -48,7 +49,7 @@ def assert_both_renderers_agree(pipelines: list[Pipeline], edits: tuple[Edit, ..
     counts = (4, 64) if any(one.operation in CURVES for one in edits) else (12, 16)
     finals = []
     for seed in range(3):
-        final = pipelines[0].final(*edits, samples=counts[0], rays=counts[1], light_samples=1, seed=seed)
+        final = pipelines[0].final(*edits, method=method, samples=counts[0], rays=counts[1], light_samples=1, seed=seed)
         finals.append(final.indirect_edited - final.indirect)
     assert np.abs(np.mean(relit, axis=0)).max() > 0.01
     # Differences of both signs cancel in the mean, which then says nothing: signs are compared one by one.
@@ -56,17 +57,21 @@ def assert_both_renderers_agree(pipelines: list[Pipeline], edits: tuple[Edit, ..
     assert_agree(compare(np.array(relit) * sign, np.array(finals) * sign, tolerance=0.03), 0.02)
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("operation", PARAMETERS)
-def test_differences_that_operations_make_are_those_of_the_relighter(operation):
-    assert_both_renderers_agree(previews(), (edit(operation),))
+def test_differences_that_operations_make_are_those_of_the_relighter(operation, method):
+    if (operation, method) == ("direction", "cached"):
+        pytest.skip("its slope is steep: over records as wide as these are in a picture of 16 pixels it is no line")
+    assert_both_renderers_agree(previews(), (edit(operation),), method)
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("operation", ["hsv", "falloff", "gamma", "unshadow"])
-def test_differences_on_glossy_receivers_are_those_of_the_relighter(operation):
+def test_differences_on_glossy_receivers_are_those_of_the_relighter(operation, method):
     everything = select("/red", "/green", "/floor", "/ceiling", "/back", "/tall", "/low")
     values = {"occluders": ("/low",)} if operation == "unshadow" else {}
     floor = select("/floor", "/tall", "/back")
-    assert_both_renderers_agree(shiny_previews(), (edit(operation, floor, everything, **values),))
+    assert_both_renderers_agree(shiny_previews(), (edit(operation, floor, everything, **values),), method)
 
 
 def test_differences_in_the_light_of_one_lamp_are_those_of_the_relighter():
