@@ -1,11 +1,11 @@
-"""What `relight` and `render` have in common: frames in, files out."""
+"""What the verbs that make images have in common: frames in, files out."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +31,7 @@ def make_images(options: argparse.Namespace, quality: Quality, make: Callable[[S
         computed.
     """
     frames: tuple[float | None, ...] = options.frames or (options.frame,)
-    files = {frame: _outputs(options.out, frame, len(frames)) for frame in frames}
+    files = {frame: [output_path(pattern, frame, len(frames)) for pattern in options.out] for frame in frames}
 
     from icheat_usd.session import Session
     from icheat_usd.stage import open_stage
@@ -76,14 +76,18 @@ def make_images(options: argparse.Namespace, quality: Quality, make: Callable[[S
             if not options.json:
                 for path in files[frame]:
                     print(path, flush=True)
+    return report(options, images, found)
+
+
+def report(options: argparse.Namespace, images: list[dict[str, Any]], found: Iterable[Any]) -> int:
+    """Say what was made and found; the exit status."""
+    findings = list(found)
     if options.json:
-        print_json(
-            {"stage": options.stage, "images": images, "findings": [finding_as_json(finding) for finding in found]}
-        )
+        print_json({"stage": options.stage, "images": images, "findings": list(map(finding_as_json, findings))})
     else:
-        for finding in found:
+        for finding in findings:
             print(finding_as_text(finding), file=sys.stderr)
-    return 1 if found and options.strict else 0
+    return 1 if findings and options.strict else 0
 
 
 def write_film(
@@ -99,18 +103,27 @@ def write_film(
         write_png(film, path, layer=layer, view=view, exposure=exposure)
 
 
-def _outputs(patterns: list[str], frame: float | None, n_frames: int) -> list[Path]:
-    paths = []
-    for pattern in patterns:
-        if Path(pattern).suffix.lower() not in _SUFFIXES:
-            raise ImageError(f"--out {pattern}: the name must end in .exr or .png")
-        if n_frames > 1 and not has_frame(pattern):
-            raise ImageError(f"--out {pattern}: {n_frames} frames would share one file; write #### for the frame")
-        try:
-            path = frame_path(pattern, frame)
-        except ValueError as error:
-            raise ImageError(f"--out: {error}") from error
-        if not path.parent.is_dir():
-            raise ImageError(f"--out {path}: there is no folder '{path.parent}'; make it first or choose another path")
-        paths.append(path)
-    return paths
+def output_path(pattern: str, frame: float | None, n_frames: int, where: str = "--out") -> Path:
+    """The file of a frame.
+
+    Parameters
+    ----------
+    where : str
+        What to call the pattern in errors.
+
+    Raises
+    ------
+    ImageError
+        It has another suffix than .exr or .png, no place for the frame, or no folder.
+    """
+    if Path(pattern).suffix.lower() not in _SUFFIXES:
+        raise ImageError(f"{where} {pattern}: the name must end in .exr or .png")
+    if n_frames > 1 and not has_frame(pattern):
+        raise ImageError(f"{where} {pattern}: {n_frames} frames would share one file; write #### for the frame")
+    try:
+        path = frame_path(pattern, frame)
+    except ValueError as error:
+        raise ImageError(f"{where}: {error}") from error
+    if not path.parent.is_dir():
+        raise ImageError(f"{where} {path}: there is no folder '{path.parent}'; make it first or choose another path")
+    return path

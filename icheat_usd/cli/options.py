@@ -79,16 +79,17 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object for programs")
 
 
-def add_image(parser: argparse.ArgumentParser) -> None:
-    """Options of the verbs that make images."""
+def add_image(parser: argparse.ArgumentParser, without_out: str = "") -> None:
+    """Options of the verbs that make images; `without_out` says what happens where no file need be named."""
     add_stage(parser)
     parser.add_argument(
         "-o",
         "--out",
         action="append",
-        required=True,
+        required=not without_out,
         metavar="FILE",
-        help=".exr (all layers) or .png (as displayed); may be given several times; #### stands for the frame",
+        help=".exr (all layers) or .png (as displayed); may be given several times; #### stands for the frame"
+        + (f"; {without_out}" if without_out else ""),
     )
     parser.add_argument(
         "--camera", metavar="PRIM", help="camera; else the render settings', else the only one; 'auto' frames the scene"

@@ -2,6 +2,18 @@
 
 icheat render shot.usda -o final.exr -o final.png
 icheat render shot.usda --frames 1:48 -o final.####.exr
+icheat render shot.usda --aov beauty --aov edit_ratio --aov crypto_object -o comp.exr
+icheat render shot.usda --frames 1:48
+
+Without -o, the products of the stage's render settings are written: their
+productName, relative to the stage, with their orderedVars as layers.
+
+Frames whose files are there, whole and made of the same scene, edits,
+settings and program, are kept; so a sequence that was stopped goes on where it
+was, and one whose edits changed is rendered where they did. An .exr has a part
+for each layer.
+
+Layers (--aov, or sourceName of a RenderVar):
 """
 
 from __future__ import annotations
@@ -10,18 +22,31 @@ import argparse
 from dataclasses import replace
 
 from icheat_usd.cli.options import add_image, positive
+from icheat_usd.session.layer_names import DEFAULT, FAMILIES, LAYERS
+
+_WIDTH = max(map(len, (*LAYERS, *FAMILIES)))
+__doc__ += "\n" + "\n".join(f"  {name:{_WIDTH}}  {what}" for name, what in {**LAYERS, **FAMILIES}.items())
 
 
 def setup_parser(parser: argparse.ArgumentParser) -> None:
-    add_image(parser)
+    add_image(parser, without_out="without it, the products of the stage's render settings are written")
+    parser.add_argument("--product", metavar="PRIM", help="write this RenderProduct alone; with -o, to that file")
+    parser.add_argument(
+        "--aov",
+        action="append",
+        metavar="NAME",
+        help=f"layer of .exr files, see above; may be given several times; default {', '.join(DEFAULT)}",
+    )
+    parser.add_argument("--single-part", action="store_true", help="all layers in one part of an .exr")
+    parser.add_argument("--force", action="store_true", help="render frames again that are there already")
     parser.add_argument("--samples", type=positive, metavar="N", help="camera samples a pixel")
     parser.add_argument("--rays", type=positive, metavar="N", help="gather rays a camera sample")
     parser.add_argument("--bounces", type=positive, metavar="N", help="diffuse reflections before the last one")
 
 
 def command(options: argparse.Namespace) -> int:
-    from icheat_usd.cli.imaging import make_images
-    from icheat_usd.session import GatherSettings, Quality
+    from icheat_usd.cli.sequence import render_frames
+    from icheat_usd.session import GatherSettings
 
     given = {
         "samples_per_pixel": options.samples,
@@ -31,4 +56,4 @@ def command(options: argparse.Namespace) -> int:
     settings = replace(
         GatherSettings(seed=options.seed), **{name: value for name, value in given.items() if value is not None}
     )
-    return make_images(options, Quality(seed=options.seed), lambda session: session.render(settings))
+    return render_frames(options, settings)

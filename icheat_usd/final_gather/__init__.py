@@ -3,6 +3,15 @@
 from icheat_usd.final_gather.extras import NO_EXTRAS, Extras
 from icheat_usd.final_gather.integrator import FinalGather, final_gather
 from icheat_usd.final_gather.irradiance_cache import CacheSettings
+from icheat_usd.final_gather.moments import weighted_gather
 from icheat_usd.final_gather.settings import GatherSettings
 
-__all__ = ["CacheSettings", "NO_EXTRAS", "Extras", "FinalGather", "GatherSettings", "final_gather"]
+__all__ = [
+    "NO_EXTRAS",
+    "CacheSettings",
+    "Extras",
+    "FinalGather",
+    "GatherSettings",
+    "final_gather",
+    "weighted_gather",
+]

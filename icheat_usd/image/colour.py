@@ -44,6 +44,11 @@ def default_display() -> str:
     return str(_config(os.environ.get("OCIO", "")).getDefaultDisplay())
 
 
+def configuration_id() -> str:
+    """A name for the content of the active configuration."""
+    return str(_config(os.environ.get("OCIO", "")).getCacheID())
+
+
 def to_display_float(
     rgb: NDArray[np.float32], *, display: str | None = None, view: str | None = None, exposure: float = 0.0
 ) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.errors import ImageError
+from icheat_usd.image.cryptomatte import Cryptomatte
 
 F32 = NDArray[np.float32]
 
@@ -25,17 +26,23 @@ class Film:
         Colour layers are scene-linear Rec.709; `depth` is in metres, `normal` a unit vector in world space.
     metadata : mapping of str to str
         Written into files as it is: stage, camera, frame, stack digest, versions.
+    mattes : tuple of Cryptomatte
+        What each pixel shows, by name.
+    pixel_aspect : float
+        Width of a pixel over its height.
 
     Raises
     ------
     ImageError
-        A layer is not float32 or does not have the film's size.
+        A layer or a matte is not float32 or does not have the film's size.
     """
 
     width: int
     height: int
     layers: Mapping[str, F32]
     metadata: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    mattes: tuple[Cryptomatte, ...] = ()
+    pixel_aspect: float = 1.0
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -47,6 +54,12 @@ class Film:
                 raise ImageError(
                     f"layer '{name}' is {found}; a {self.width} x {self.height} film holds float32 arrays of shape "
                     f"{sizes[0]} or {sizes[1]}"
+                )
+        for matte in self.mattes:
+            if matte.ranks.dtype != np.float32 or matte.ranks.shape[:2] != (self.height, self.width):
+                raise ImageError(
+                    f"matte '{matte.name}' is {matte.ranks.dtype} {matte.ranks.shape}; a {self.width} x {self.height}"
+                    " film holds float32 arrays of (height, width, ranks, 2)"
                 )
         for key, text in self.metadata.items():
             if not isinstance(key, str) or not isinstance(text, str):

@@ -10,9 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from icheat_usd.errors import ImageError
 from icheat_usd.image.colour import default_display, to_display
-from icheat_usd.image.exr import METADATA_PREFIX, replacing
+from icheat_usd.image.exr import METADATA_PREFIX
 from icheat_usd.image.film import Film
+from icheat_usd.image.replacing import replacing
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def write_png(
@@ -58,6 +62,33 @@ def write_png(
     return target
 
 
+def read_text(path: str | os.PathLike[str]) -> dict[str, str]:
+    """The metadata of a PNG that `write_png` wrote.
+
+    Raises
+    ------
+    ImageError
+        The file cannot be read, is no PNG, or is damaged or cut short.
+    """
+    source = Path(path)
+    try:
+        content = source.read_bytes()
+    except OSError as problem:
+        raise ImageError(f"{source}: cannot read the image ({problem.strerror}); check the path") from problem
+    found: dict[str, str] = {}
+    at, kind = len(_SIGNATURE), b""
+    while kind != b"IEND":
+        length = int.from_bytes(content[at : at + 4], "big")
+        kind, body = content[at + 4 : at + 8], content[at + 8 : at + 8 + length]
+        if not content.startswith(_SIGNATURE) or content[at : at + 12 + length] != _chunk(kind, body):
+            raise ImageError(f"{source}: not a PNG file, or damaged; write it again")
+        if kind == b"iTXt":
+            key, _, value = body.partition(b"\0")
+            found[key.decode("latin-1").removeprefix(METADATA_PREFIX)] = value[4:].decode("utf-8", "replace")
+        at += 12 + length
+    return found
+
+
 def encode_png(pixels: NDArray[np.uint8], *, srgb: bool, text: dict[str, str]) -> bytes:
     """An 8-bit RGB image as the bytes of a PNG file.
 
@@ -87,7 +118,7 @@ def encode_png(pixels: NDArray[np.uint8], *, srgb: bool, text: dict[str, str]) -
         chunks.append(_chunk(b"iTXt", keyword + b"\0\0\0\0\0" + value.encode("utf-8", "replace")))
     chunks.append(_chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)))
     chunks.append(_chunk(b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+    return _SIGNATURE + b"".join(chunks)
 
 
 def _chunk(kind: bytes, body: bytes) -> bytes:

@@ -77,6 +77,14 @@ def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKey
     return ShotKeys(scene, view, gather, bounces, training, transport, packed, lights, cell_light, view_light)
 
 
+def snapshot_key(snapshot: SceneSnapshot, engine: str) -> str:
+    """Key of all that a final frame takes from a snapshot, and of the code that makes it."""
+    tables = (snapshot.geometry, snapshot.materials, snapshot.textures, snapshot.lights, snapshot.light_paths)
+    surfaces = [(s.path, s.instance_id, s.part, s.topology_digest) for s in snapshot.surfaces]
+    place = (asdict(snapshot.camera), snapshot.centre, snapshot.radius)
+    return digest(_FORMAT, code_digest(), engine, tables, surfaces, snapshot.material_paths, place)
+
+
 def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     """All settings but those that other keys hold, or that come after the transport."""
     elsewhere = {"n_gather", "rays_per_bounce_row", "light_samples", "dome_samples", "n_bounces", "samples_per_pixel"}

@@ -13,13 +13,14 @@ from icheat_usd.edits.facts import facts
 from icheat_usd.edits.model import EMPTY_STACK, Blend, EditStack, SurfaceMask, Value
 from icheat_usd.edits.painting import Brush, paint_mask
 from icheat_usd.errors import EditError, StageError
-from icheat_usd.final_gather import GatherSettings, final_gather
+from icheat_usd.final_gather import GatherSettings
 from icheat_usd.image.film import Film
 from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import Finding, SceneSnapshot
-from icheat_usd.session import authoring, films, keys
+from icheat_usd.session import authoring, films, keys, layer_names
 from icheat_usd.session.disk_cache import DiskCache
 from icheat_usd.session.quality import FINAL, PREVIEW, Quality
+from icheat_usd.session.rendering import render_film
 from icheat_usd.session.shot_parts import Memory, ShotParts
 from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
@@ -50,6 +51,7 @@ class Session(ShotParts):
         progress: Progress,
         disk: DiskCache | None = None,
         memory: Memory | None = None,
+        product: str | None = None,
     ) -> None:
         super().__init__(quality, engine=tracer, progress=progress, disk=disk, memory=memory)
         self.stage = stage
@@ -57,6 +59,7 @@ class Session(ShotParts):
         self.frame = frame
         self._stack_path = stack
         self._size = (width, height)
+        self._product = product
 
     @classmethod
     def open(
@@ -73,6 +76,7 @@ class Session(ShotParts):
         progress: Progress = silent,
         disk: DiskCache | None = None,
         memory: Memory | None = None,
+        product: str | None = None,
     ) -> Session:
         """Open a stage.
 
@@ -91,6 +95,8 @@ class Session(ShotParts):
             Where expensive parts are kept; by default in the user's cache folder, as ``$ICHEAT_CACHE_SIZE`` says.
         memory : Memory, optional
             Where sessions at other frames of the stage find parts that are the same.
+        product : str, optional
+            Prim path of the RenderProduct whose camera and resolution count; the render settings' first one by default.
 
         Raises
         ------
@@ -111,6 +117,7 @@ class Session(ShotParts):
             progress=progress,
             disk=disk,
             memory=memory,
+            product=product,
         )
 
     def at(self, frame: float | None, *, memory: Memory | None = None) -> Session:
@@ -127,6 +134,7 @@ class Session(ShotParts):
             progress=self.progress,
             disk=self._disk,
             memory=memory if self._memory is None else self._memory,
+            product=self._product,
         )
 
     @cached_property
@@ -134,7 +142,13 @@ class Session(ShotParts):
         """The stage at the session's frame."""
         width, height = self._size
         snapshot = take_snapshot(
-            self.stage, camera=self.camera, time=self.frame, width=width, height=height, progress=self.progress
+            self.stage,
+            camera=self.camera,
+            time=self.frame,
+            width=width,
+            height=height,
+            product=self._product,
+            progress=self.progress,
         )
         if len(snapshot.geometry.face) == 0:
             reasons = "; ".join(f"{f.prim}: {f.message}" for f in snapshot.findings[:3])
@@ -182,23 +196,23 @@ class Session(ShotParts):
             self.view, relighter.relight(field), self.metadata("relight", stack, asdict(self.quality))
         )
 
-    def render(self, settings: GatherSettings = FINAL) -> Film:
-        """Final frame by gathering at every camera sample; same layers as `relight`."""
-        stack = self.stack
-        field = bind(stack, self.snapshot)
-        gather, radiance = None, None
-        if settings.method == "cached" or field.uses_incident or field.has_offset:
-            gather, radiance = self.gather, self.cell_light.radiance
-        result = final_gather(
-            self.snapshot,
-            self.tracer,
-            field,
-            settings=settings,
-            gather=gather,
-            gather_radiance=radiance,
-            progress=self.progress,
+    def render(self, settings: GatherSettings = FINAL, layers: Sequence[str] = layer_names.DEFAULT) -> Film:
+        """Final frame by gathering at every camera sample.
+
+        Parameters
+        ----------
+        layers : names
+            Of `LAYERS`, `FAMILIES` or `ALIASES` in `session.layer_names`, ``light.NAME`` or ``edit.NAME``.
+
+        Raises
+        ------
+        ImageError
+            There is no such layer; the message lists those there are.
+        """
+        sources = [layer_names.canonical(name) for name in layers]
+        return render_film(
+            self, settings, [layer_names.Layer(source, layer_names.layer_name(source)) for source in sources]
         )
-        return films.final_film(result, self.metadata("final gather", stack, asdict(settings)))
 
     def metadata(self, renderer: str, stack: EditStack, settings: Mapping[str, Any]) -> dict[str, str]:
         """What made an image, for its file."""

@@ -22,6 +22,7 @@ from icheat_usd.relight import Relighter, build_relighter
 from icheat_usd.samples import ViewSamples, gather_samples, view_samples
 from icheat_usd.samples.develop import develop
 from icheat_usd.scene import F64
+from icheat_usd.session.aovs import names_of
 from icheat_usd.session.document import Session
 from icheat_usd.stage.description import EditDescription, describe_edit
 from icheat_usd.transport import build_bounces, build_transport, light_cells
@@ -299,17 +300,7 @@ def contribution_film(session: Session) -> Film:
         "indirect": image(develop(view, relit.indirect)),
         "indirect_edited": image(develop(view, relit.indirect_edited)),
     }
-    for edit, name in zip(stack.active, _names(stack.active), strict=True):
+    for edit, name in zip(stack.active, names_of([edit.path for edit in stack.active]), strict=True):
         without = relighter.relight(bind(_without(stack, edit), session.snapshot)).indirect_edited
         layers[f"edit.{name}"] = image(develop(view, relit.indirect_edited - without))
     return Film(view.width, view.height, layers, session.metadata("explain", stack, asdict(session.quality)))
-
-
-def _names(edits: tuple[Edit, ...]) -> list[str]:
-    """A name for each edit; numbered where two share one."""
-    seen: dict[str, int] = {}
-    names = []
-    for edit in edits:
-        seen[edit.name] = seen.get(edit.name, 0) + 1
-        names.append(edit.name if seen[edit.name] == 1 else f"{edit.name}_{seen[edit.name]}")
-    return names

@@ -76,6 +76,11 @@ class ShotParts:
         if snapshot is not None:
             self.__dict__["snapshot"] = snapshot
 
+    @property
+    def engine(self) -> str:
+        """Name of the ray tracer."""
+        return self._engine
+
     @cached_property
     def snapshot(self) -> SceneSnapshot:
         """What is rendered."""

@@ -28,15 +28,22 @@ class RenderChoices:
     material_purpose: str = "full"
 
 
-def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode) -> RenderChoices:
-    """The settings that the stage names as ``renderSettingsPrimPath``, and its first product's overrides of them."""
+def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode, product: str | None = None) -> RenderChoices:
+    """The settings that the stage names as ``renderSettingsPrimPath``, and a product's overrides of them.
+
+    Parameters
+    ----------
+    product
+        Path of the product; the settings' first one by default.
+    """
     settings = UsdRender.Settings.GetStageRenderSettings(stage)
-    if not settings:
+    bases = [settings] if settings else []
+    targets = settings.GetProductsRel().GetForwardedTargets()[:1] if settings else []
+    for target in targets if product is None else [product]:
+        if chosen := UsdRender.Product(stage.GetPrimAtPath(target)):
+            bases.insert(0, chosen)
+    if not bases:
         return RenderChoices()
-    bases = [settings]
-    for target in settings.GetProductsRel().GetForwardedTargets()[:1]:
-        if product := UsdRender.Product(stage.GetPrimAtPath(target)):
-            bases.insert(0, product)
 
     def first(name: str, fallback: object) -> object:
         for base in bases:
@@ -50,8 +57,8 @@ def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode) -> RenderChoices:
     purposes = first("materialBindingPurposes", ["full", ""])
     return RenderChoices(
         camera=cameras[0] if cameras else None,
-        resolution=None if resolution is None else _pixels(settings, resolution),
-        pixel_aspect=_number(settings, first("pixelAspectRatio", 1.0)),
+        resolution=None if resolution is None else _pixels(bases[-1], resolution),
+        pixel_aspect=_number(bases[-1], first("pixelAspectRatio", 1.0)),
         conform=str(first("aspectRatioConformPolicy", "expandAperture")),
         depth_of_field=not first("disableDepthOfField", False),
         # The second is the first one's name in older stages.

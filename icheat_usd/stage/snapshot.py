@@ -36,6 +36,7 @@ def take_snapshot(
     height: int | None = None,
     subdivision_level: int = 2,
     purposes: Sequence[str] = ("default", "render"),
+    product: str | None = None,
     progress: Progress = silent,
 ) -> SceneSnapshot:
     """Read everything that is rendered from a stage at one time.
@@ -55,6 +56,8 @@ def take_snapshot(
         Steps of subdivision surfaces.
     purposes
         Purposes that are shown.
+    product
+        Path of the RenderProduct whose opinions about the image count; the render settings' first one by default.
     progress
         Told how far the reading is.
 
@@ -74,7 +77,7 @@ def take_snapshot(
     when = Usd.TimeCode.EarliestTime() if code is None else Usd.TimeCode(code)
     report = Reporter()
     with quiet_usd():
-        choices = read_render_choices(stage, when)
+        choices = read_render_choices(stage, when, product)
         wanted = None if camera is None else str(camera)
         camera_prim = None if wanted == AUTO_CAMERA else find_camera(stage, wanted, choices)
         report.extend(composition_findings(stage))

@@ -1,0 +1,137 @@
+"""The layers that a final frame can have, and what pipelines call them; needs no renderer."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+from icheat_usd.errors import ImageError
+
+#: What a final frame has unless something else is asked for.
+DEFAULT = ("beauty", "direct", "indirect", "indirect_edited", "edit_delta", "albedo", "normal", "depth")
+
+#: Every layer but those of single lights and edits.
+LAYERS: Mapping[str, str] = MappingProxyType(
+    {
+        "beauty": "direct + indirect_edited",
+        "direct": "background + emission + light that surfaces in sight reflect straight from the lights",
+        "indirect": "light that they reflect from other surfaces, without edits",
+        "indirect_edited": "the same with edits",
+        "edit_delta": "beauty less beauty without edits: add it to any renderer's beauty",
+        "edit_ratio": "beauty over beauty without edits: multiply any renderer's beauty by it; 1 where nothing changes",
+        "emission": "what glows in sight",
+        "background": "domes in sight",
+        "albedo": "diffuse reflectance",
+        "normal": "world space",
+        "depth": "length of the path from the eye, metres",
+        "crypto_object": "Cryptomatte of prims",
+        "crypto_edit": "Cryptomatte of the edits that pixels receive",
+    }
+)
+
+#: Families: one layer for each light, or each edit.
+FAMILIES: Mapping[str, str] = MappingProxyType(
+    {
+        "lights": "light.NAME of every light: its part of direct",
+        "edits": "edit.NAME of every edit: they sum to edit_delta",
+    }
+)
+
+#: Other names of `sourceName` in RenderVar prims.
+ALIASES: Mapping[str, str] = MappingProxyType(
+    {
+        "Ci": "beauty",
+        "C": "beauty",
+        "color": "beauty",
+        "rgba": "beauty",
+        "Z": "depth",
+        "z": "depth",
+        "N": "normal",
+        "Nn": "normal",
+        "CryptoObject": "crypto_object",
+        "CryptoEdit": "crypto_edit",
+    }
+)
+
+#: Light path expressions that say exactly what a layer holds. Camera paths follow mirrors and glass (S*) before the
+#: first surface that scatters, whose diffuse and glossy lobes ([DG]) are not told apart; expressions for one lobe,
+#: such as C<RD>L, are therefore no layer. The light of a beauty is edited, so that its parts sum to it.
+EXPRESSIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "C.*": "beauty",
+        "C.*[LO]": "beauty",
+        "C.*[<L.>O]": "beauty",
+        "C[DS]*[<L.>O]": "beauty",
+        "CS*[DG]?[LO]": "direct",
+        "CS*[DG]?[<L.>O]": "direct",
+        "CS*[DG].+[LO]": "indirect_edited",
+        "CS*[DG].+[<L.>O]": "indirect_edited",
+        "CS*O": "emission",
+    }
+)
+
+
+class MatteName(NamedTuple):
+    kind: str  #: of `FinalGather.coverage`
+    name: str  #: type name in files
+
+
+MATTES: Mapping[str, MatteName] = MappingProxyType(
+    {"crypto_object": MatteName("object", "CryptoObject"), "crypto_edit": MatteName("edit", "CryptoEdit")}
+)
+
+#: Layers of one number a pixel.
+SCALARS = frozenset({"depth"})
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer of a film by what it holds."""
+
+    source: str  #: name in `LAYERS`, ``light.NAME`` or ``edit.NAME``
+    name: str  #: in the film; mattes: the type name
+
+
+def canonical(source: str, kind: str = "raw", where: str = "") -> str:
+    """The layer, or the family of layers, that a source name stands for.
+
+    Parameters
+    ----------
+    kind : str
+        sourceType of a RenderVar.
+
+    Raises
+    ------
+    ImageError
+        There is no such layer; the message lists those there are.
+    """
+    place = f"{where}: " if where else ""
+    text = source.strip()
+    if kind == "lpe" or text.startswith("lpe:"):
+        expression = re.sub(r"\s", "", text.removeprefix("lpe:"))
+        if expression in EXPRESSIONS:
+            return EXPRESSIONS[expression]
+        known = ", ".join(f"{path} ({layer})" for path, layer in EXPRESSIONS.items())
+        raise ImageError(f"{place}no layer holds exactly the light of '{source}'; there are {known}")
+    if kind in ("raw", "intrinsic"):
+        found = ALIASES.get(text, text)
+        if found in LAYERS or found in FAMILIES or re.match(r"(light|edit)\.\w", found):
+            return found
+    names = ", ".join((*LAYERS, "light.NAME", "edit.NAME"))
+    aliases = ", ".join(f"{alias} = {name}" for alias, name in ALIASES.items())
+    what = f"'{source}'" if kind == "raw" else f"{kind} '{source}'"
+    raise ImageError(f"{place}there is no layer {what}; there are {names} ({aliases})")
+
+
+def n_channels(source: str) -> int:
+    """Numbers a pixel has in a layer; 0 for mattes, which have as many as they need."""
+    return 0 if source in MATTES else 1 if source in SCALARS else 3
+
+
+def layer_name(source: str, wanted: str = "") -> str:
+    """What a layer is called in a film: as wanted, unless that is one of its own other names."""
+    usual = MATTES[source].name if source in MATTES else source
+    return usual if not wanted or ALIASES.get(wanted, wanted) == source else wanted
