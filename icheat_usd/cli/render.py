@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from typing import Any
 
 from icheat_usd.cli.options import add_image, positive
 from icheat_usd.session.layer_names import DEFAULT, FAMILIES, LAYERS
@@ -40,8 +41,24 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--single-part", action="store_true", help="all layers in one part of an .exr")
     parser.add_argument("--force", action="store_true", help="render frames again that are there already")
     parser.add_argument("--samples", type=positive, metavar="N", help="camera samples a pixel")
-    parser.add_argument("--rays", type=positive, metavar="N", help="gather rays a camera sample")
+    parser.add_argument("--edge-samples", type=at_least_0, metavar="N", help="more of them in pixels that hold edges")
+    parser.add_argument("--filter", metavar="NAME", help="box, triangle, gaussian or blackman-harris; default box")
+    parser.add_argument("--filter-width", type=float, metavar="PIXELS", help="of its support; default the usual one")
+    parser.add_argument(
+        "--method",
+        choices=("cached", "brute"),
+        help="cached: irradiance is interpolated where it is smooth; brute: every camera sample gathers for itself, "
+        "slow and unbiased",
+    )
+    parser.add_argument("--rays", type=positive, metavar="N", help="gather rays where no light is cached")
     parser.add_argument("--bounces", type=positive, metavar="N", help="diffuse reflections before the last one")
+
+
+def at_least_0(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{value} is less than 0")
+    return value
 
 
 def command(options: argparse.Namespace) -> int:
@@ -52,8 +69,10 @@ def command(options: argparse.Namespace) -> int:
         "samples_per_pixel": options.samples,
         "gather_rays": options.rays,
         "n_bounces": options.bounces,
+        "edge_samples": options.edge_samples,
+        "pixel_filter": options.filter,
+        "filter_width": options.filter_width,
+        "method": options.method,
     }
-    settings = replace(
-        GatherSettings(seed=options.seed), **{name: value for name, value in given.items() if value is not None}
-    )
-    return render_frames(options, settings)
+    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    return render_frames(options, replace(GatherSettings(seed=options.seed), **chosen))

@@ -59,7 +59,7 @@ def Scope "Render"
 """
 
 #: A frame in a fraction of a second.
-QUICK = ("--samples", "1", "--rays", "8", "--bounces", "2")
+QUICK = ("--method", "brute", "--samples", "1", "--rays", "8", "--bounces", "2")
 
 
 def make_stage(folder: Path, text: str = STAGE) -> Path:
