@@ -66,50 +66,6 @@ def find_edges(starts: I64, indices: I64, n_vertices: int, of_corner: I64, lo: I
 
 
 @kernel
-def boundary(
-    vertices: F64,
-    valence: I64,
-    lo: I64,
-    hi: I64,
-    n_faces: I64,
-    sharp_corners: bool,
-    kind: U8,
-    neighbours: F64,
-) -> None:
-    """Sort vertices into smooth (0), on a boundary curve (1) and fixed (2).
-
-    Parameters
-    ----------
-    vertices : (n, k)
-    valence : (n,)
-        Polygons at each vertex.
-    lo, hi, n_faces : (n_edges,)
-    sharp_corners
-        Whether boundary vertices of one polygon are fixed.
-    kind : (n,) out
-    neighbours : (n, k) out
-        Sum of the vertices at the other ends of boundary edges.
-    """
-    n, width = vertices.shape
-    count = np.zeros(n, np.int64)
-    neighbours[:] = 0.0
-    for e in range(len(lo)):
-        if n_faces[e] != 2:
-            a, b = lo[e], hi[e]
-            count[a] += 1
-            count[b] += 1
-            for k in range(width):
-                neighbours[a, k] += vertices[b, k]
-                neighbours[b, k] += vertices[a, k]
-    for v in range(n):
-        kind[v] = 0
-        if valence[v] == 0:
-            kind[v] = 2
-        elif count[v] > 0:
-            kind[v] = 1 if count[v] == 2 and not (sharp_corners and valence[v] == 1) else 2
-
-
-@kernel
 def split_vertices(
     vertices: F64,
     starts: I64,
@@ -117,9 +73,9 @@ def split_vertices(
     of_corner: I64,
     lo: I64,
     hi: I64,
-    n_faces: I64,
+    edges: F64,
     valence: I64,
-    kind: U8,
+    weights: F64,
     neighbours: F64,
     smooth: bool,
     out: F64,
@@ -128,8 +84,10 @@ def split_vertices(
 
     Parameters
     ----------
-    kind, neighbours
-        From `boundary`.
+    edges : (n_edges,)
+        Sharpness; boundaries are sharp.
+    weights, neighbours
+        From `creases.vertex_rules`.
     smooth
         False puts every new vertex in the middle and moves none.
     out : (n_vertices + n_edges + n_polygons, k) out
@@ -164,19 +122,25 @@ def split_vertices(
             middle = 0.5 * (vertices[a, k] + vertices[b, k])
             ends[a, k] += middle
             ends[b, k] += middle
-            if smooth and n_faces[e] == 2:
-                out[n + e, k] = 0.5 * middle + 0.25 * out[n + e, k]
+            sharp = min(edges[e], 1.0) if smooth else 1.0
+            if sharp < 1.0:
+                out[n + e, k] = sharp * middle + (1.0 - sharp) * (0.5 * middle + 0.25 * out[n + e, k])
             else:
                 out[n + e, k] = middle
     for v in range(n):
+        rounded, curved = weights[v]
+        fixed = 1.0 - rounded - curved
         for k in range(width):
-            if not smooth or kind[v] == 2:
+            if not smooth:
                 out[v, k] = vertices[v, k]
-            elif kind[v] == 1:
-                out[v, k] = 0.75 * vertices[v, k] + 0.125 * neighbours[v, k]
-            else:
-                faces, edges = out[v, k] / valence[v], ends[v, k] / degree[v]
-                out[v, k] = (faces + 2.0 * edges + (valence[v] - 3.0) * vertices[v, k]) / valence[v]
+                continue
+            value = 0.0
+            if rounded > 0.0:
+                faces, middles = out[v, k] / valence[v], ends[v, k] / degree[v]
+                value += rounded * ((faces + 2.0 * middles + (valence[v] - 3.0) * vertices[v, k]) / valence[v])
+            if curved > 0.0:
+                value += curved * (0.75 * vertices[v, k] + 0.125 * neighbours[v, k])
+            out[v, k] = value + fixed * vertices[v, k]
 
 
 @kernel
@@ -217,9 +181,11 @@ def split_corners(
 
 @kernel
 def limit_vertices(
-    vertices: F64, indices: I64, lo: I64, hi: I64, valence: I64, kind: U8, neighbours: F64, out: F64
+    vertices: F64, indices: I64, lo: I64, hi: I64, valence: I64, weights: F64, neighbours: F64, out: F64
 ) -> None:
-    """Limit positions of the vertices of an all-quad mesh [1]_; `kind` and `neighbours` from `boundary`.
+    """Limit positions of the vertices of an all-quad mesh [1]_, with what is sharp sharp for ever.
+
+    `weights` and `neighbours` are from `creases.vertex_rules`.
 
     References
     ----------
@@ -238,17 +204,17 @@ def limit_vertices(
     for v in range(n):
         d = float(valence[v])
         for k in range(width):
-            if kind[v] == 2:
-                out[v, k] = vertices[v, k]
-            elif kind[v] == 1:
+            if weights[v, 0] > 0.0:
+                out[v, k] = (d * d * vertices[v, k] + out[v, k]) / (d * (d + 5.0))
+            elif weights[v, 1] > 0.0:
                 out[v, k] = (4.0 * vertices[v, k] + neighbours[v, k]) / 6.0
             else:
-                out[v, k] = (d * d * vertices[v, k] + out[v, k]) / (d * (d + 5.0))
+                out[v, k] = vertices[v, k]
 
 
 @kernel
-def vertex_normals(vertices: F64, starts: I64, indices: I64, out: F64) -> None:
-    """Sum, at each vertex, of the cross products of the edges at its corners; ``(n, 3)`` out, not unit."""
+def vertex_normals(vertices: F64, starts: I64, indices: I64, group: I64, out: F64) -> None:
+    """Sum, over each group of corners, of the cross products of the edges there; ``(n_groups, 3)`` out, not unit."""
     out[:] = 0.0
     for f in range(len(starts) - 1):
         first, last = starts[f], starts[f + 1]
@@ -266,9 +232,9 @@ def vertex_normals(vertices: F64, starts: I64, indices: I64, out: F64) -> None:
                 vertices[b, 1] - vertices[v, 1],
                 vertices[b, 2] - vertices[v, 2],
             )
-            out[v, 0] += ay * bz - az * by
-            out[v, 1] += az * bx - ax * bz
-            out[v, 2] += ax * by - ay * bx
+            out[group[c], 0] += ay * bz - az * by
+            out[group[c], 1] += az * bx - ax * bz
+            out[group[c], 2] += ax * by - ay * bx
 
 
 @kernel

@@ -11,11 +11,12 @@ from pxr import Usd, UsdGeom
 
 from icheat_usd.kernels import meshing
 from icheat_usd.scene import F32, F64, I32, I64
+from icheat_usd.stage.creases import faces_without_a_surface, read_creases
 from icheat_usd.stage.polygons import THINNEST, face_parametrisation, triangulate
 from icheat_usd.stage.primvars import MeshValues, Topology, expand, find_primvar, read_primvar
 from icheat_usd.stage.reporting import Reporter
 from icheat_usd.stage.skinning import Deformation
-from icheat_usd.stage.subdivision import Cage, refine
+from icheat_usd.stage.subdivision import NO_CREASES, Cage, Creases, refine, smooth_normals
 
 #: UsdPreviewSurface's own diffuseColor, for a mesh without displayColor.
 DEFAULT_COLOR = 0.18
@@ -132,6 +133,7 @@ class _ControlMesh:
     scheme: str
     level: int
     sharp_corners: bool
+    creases: Creases
     left_handed: bool
     double_sided: bool
     shown: NDArray[np.bool_]  #: (n_faces,) False for holes
@@ -149,7 +151,7 @@ class _ControlMesh:
         digest.update(
             repr((flags, [(name, c.on_vertices, c.values.shape) for name, c in self.columns.items()])).encode()
         )
-        arrays = [self.points, self.counts, self.indices, self.shown, self.st_column]
+        arrays = [self.points, self.counts, self.indices, self.shown, self.st_column, *self.creases]
         for array in (*arrays, *(column.values for column in self.columns.values())):
             # What was broadcast from one value is hashed as one.
             data = array[:1] if array.ndim == 2 and array.strides[0] == 0 else array
@@ -173,14 +175,19 @@ def _build(control: _ControlMesh) -> TriangleMesh | None:
         control.indices,
         np.concatenate(corner_columns, axis=1),
         np.arange(control.n_faces),
+        control.creases,
     )
     cage = _only(cage, control.counts >= 3)
     if not len(cage.counts):
         return None
     if control.scheme in ("catmullClark", "bilinear"):
         cage = refine(cage, control.level, smooth=control.scheme == "catmullClark", sharp_corners=control.sharp_corners)
-    vertex_normals = _smooth_normals(cage) if control.scheme in ("catmullClark", "loop") else None
-    cage = _only(cage, control.shown[cage.face])
+    shown = control.shown[cage.face]
+    smooth: tuple[F64, I64] | None = None  # normals, and the row of each corner
+    if control.scheme in ("catmullClark", "loop"):
+        normals_found, row_of_corner = smooth_normals(cage)
+        smooth = normals_found, row_of_corner[np.repeat(shown, cage.counts)]
+    cage = _only(cage, shown)
     if not len(cage.counts):
         return None
 
@@ -190,7 +197,7 @@ def _build(control: _ControlMesh) -> TriangleMesh | None:
     corners, triangle_face = triangulate(positions, cage.counts, cage.indices)
     if control.left_handed:
         corners = np.ascontiguousarray(corners[:, [0, 2, 1]])
-        vertex_normals = None if vertex_normals is None else -vertex_normals
+        smooth = None if smooth is None else (-smooth[0], smooth[1])
     vertex = cage.indices[corners]
     flat, good = measure(positions, vertex)
     if not good.any():
@@ -212,8 +219,8 @@ def _build(control: _ControlMesh) -> TriangleMesh | None:
             chosen = control.st_column[control_face] == which
             st[chosen] = values[chosen]
     color = gather("displayColor", 3)
-    if vertex_normals is not None:
-        normals = unit_normals(vertex_normals, vertex, flat)
+    if smooth is not None:
+        normals = unit_normals(smooth[0], smooth[1][corners], flat)
     elif "normals" in places:
         on_vertices, begin, end = places["normals"]
         source = (cage.vertices if on_vertices else cage.corners)[:, begin:end]
@@ -280,10 +287,11 @@ def _read_control_mesh(
         report(prim, "subdivisionScheme", f"'{scheme}' is no subdivision scheme; the mesh is taken as polygons.")
         scheme = "none"
     boundary = str(mesh.GetInterpolateBoundaryAttr().Get(time))
+    creases, shown = NO_CREASES, _shown_faces(mesh, time, len(counts), report)
     if scheme == "catmullClark":
-        _report_creases(mesh, time, report)
+        creases = read_creases(mesh, time, counts, indices, report)
         if boundary == "none":
-            report(prim, "interpolateBoundary none", "faces at the boundary are kept, as with edgeAndCorner.")
+            shown &= ~faces_without_a_surface(counts, indices, creases)
     refined = scheme in ("catmullClark", "bilinear")
 
     sizes = Topology(len(points), counts, indices)
@@ -303,9 +311,10 @@ def _read_control_mesh(
         scheme=scheme,
         level=_affordable_level(len(indices), level, prim, report) if refined else 0,
         sharp_corners=boundary != "edgeOnly",
+        creases=creases,
         left_handed=str(mesh.GetOrientationAttr().Get(time)) == "leftHanded",
         double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
-        shown=_shown_faces(mesh, time, len(counts), report),
+        shown=shown,
         columns={name: column for name, column in wanted if column is not None},
         st_column=st_column,
         rows=rows,
@@ -384,11 +393,6 @@ def _shown_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode, n_faces: int, report: R
     return shown
 
 
-def _report_creases(mesh: UsdGeom.Mesh, time: Usd.TimeCode, report: Reporter) -> None:
-    if mesh.GetCreaseIndicesAttr().Get(time) or mesh.GetCornerIndicesAttr().Get(time):
-        report(mesh.GetPrim(), "creases", "creases and sharp corners are not supported; the surface is smooth there.")
-
-
 def _affordable_level(n_corners: int, level: int, prim: Usd.Prim, report: Reporter) -> int:
     affordable = level
     while affordable > 0 and n_corners * 2 * 4 ** (affordable - 1) > MOST_TRIANGLES:
@@ -406,14 +410,9 @@ def _only(cage: Cage, kept: NDArray[np.bool_]) -> Cage:
     if kept.all():
         return cage
     corners = np.repeat(kept, cage.counts)
-    return Cage(cage.vertices, cage.counts[kept], cage.indices[corners], cage.corners[corners], cage.face[kept])
-
-
-def _smooth_normals(cage: Cage) -> F64:
-    """Area-weighted mean of the faces' normals at each vertex; not unit."""
-    normals = np.empty((len(cage.vertices), 3))
-    meshing.vertex_normals(cage.vertices, np.concatenate([[0], np.cumsum(cage.counts)]), cage.indices, normals)
-    return normals
+    return cage._replace(
+        counts=cage.counts[kept], indices=cage.indices[corners], corners=cage.corners[corners], face=cage.face[kept]
+    )
 
 
 def _origin(points: F64) -> F64:

@@ -1,8 +1,8 @@
 """Catmull-Clark surfaces, refined a few times and then set on their limit.
 
 OpenSubdiv does not come with the ``usd-core`` wheel, and no light package has
-it. Creases and corners that are sharp on purpose are not followed; boundaries
-are, by ``interpolateBoundary``.
+it. Its rules are followed: boundaries by ``interpolateBoundary``, creases and
+corners as sharp as they say.
 """
 
 from __future__ import annotations
@@ -11,8 +11,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.kernels import meshing
-from icheat_usd.scene import F64, I64, U8
+from icheat_usd.kernels import creases, meshing
+from icheat_usd.scene import F64, I64
+
+#: From here on, an edge or corner is sharp for ever: USD's SHARPNESS_INFINITE.
+INFINITE = creases.INFINITE
+
+
+class Creases(NamedTuple):
+    """What is sharp on a mesh, and how much: 0 is smooth, 1 sharp for one step, `INFINITE` for ever."""
+
+    edges: I64  #: (n, 2) vertices
+    sharpness: F64  #: (n,)
+    corners: I64  #: (m,) vertices
+    corner_sharpness: F64  #: (m,)
+
+
+NO_CREASES = Creases(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, np.int64), np.empty(0))
 
 
 class Cage(NamedTuple):
@@ -23,6 +38,7 @@ class Cage(NamedTuple):
     indices: I64  #: (n_corners,)
     corners: F64  #: (n_corners, m) interpolated linearly within faces
     face: I64  #: (n_faces,) control face
+    creases: Creases = NO_CREASES
 
 
 def refine(cage: Cage, level: int, *, smooth: bool = True, sharp_corners: bool = True) -> Cage:
@@ -41,13 +57,15 @@ def refine(cage: Cage, level: int, *, smooth: bool = True, sharp_corners: bool =
 
     Notes
     -----
-    Edges of one face, or of more than two, are boundaries: their vertices
-    follow the cubic B-spline through the boundary alone.
+    Edges of one face, or of more than two, are boundaries, and sharp for ever:
+    their vertices follow the cubic B-spline through the boundary alone. So do
+    those on a crease, as long as it is sharp. Creases that are no edges are left out.
 
     References
     ----------
     .. [1] Catmull and Clark, CAD 10(6), 1978.
     .. [2] Halstead, Kass and DeRose, SIGGRAPH 1993: limit positions.
+    .. [3] DeRose, Kass and Truong, SIGGRAPH 1998: sharpness.
     """
     for _ in range(level):
         cage = _split(cage, smooth, sharp_corners)
@@ -65,8 +83,8 @@ class _Topology(NamedTuple):
     hi: I64
     n_faces: I64  #: faces at each edge
     valence: I64  #: faces at each vertex
-    kind: U8  #: 0 smooth, 1 on a boundary curve, 2 fixed
-    neighbours: F64  #: sum of the neighbours along the boundary
+    edges: F64  #: sharpness of each edge
+    corners: F64  #: sharpness of each vertex
 
 
 def _analyse(cage: Cage, sharp_corners: bool) -> _Topology:
@@ -76,9 +94,37 @@ def _analyse(cage: Cage, sharp_corners: bool) -> _Topology:
     n_edges = meshing.find_edges(starts, cage.indices, n, of_corner, lo, hi, n_faces)
     lo, hi, n_faces = lo[:n_edges].copy(), hi[:n_edges].copy(), n_faces[:n_edges].copy()
     valence = np.bincount(cage.indices, minlength=n)
-    kind, neighbours = np.empty(n, np.uint8), np.empty(cage.vertices.shape)
-    meshing.boundary(cage.vertices, valence, lo, hi, n_faces, sharp_corners, kind, neighbours)
-    return _Topology(starts, of_corner, lo, hi, n_faces, valence, kind, neighbours)
+    edges, corners = np.zeros(n_edges), np.zeros(n)
+    found = find_edges(lo, hi, cage.creases.edges)
+    edges[found[found >= 0]] = np.minimum(cage.creases.sharpness[found >= 0], INFINITE)
+    corners[cage.creases.corners] = np.minimum(cage.creases.corner_sharpness, INFINITE)
+    creases.mark_boundaries(lo, hi, n_faces, valence, sharp_corners, edges, corners)
+    return _Topology(starts, of_corner, lo, hi, n_faces, valence, edges, corners)
+
+
+def find_edges(lo: I64, hi: I64, wanted: I64) -> I64:
+    """Rows of edges (n, 2) in a list of edges; -1 for one that is not there.
+
+    Parameters
+    ----------
+    lo, hi : (n_edges,)
+        Lower and higher vertex of each.
+    """
+    if not len(wanted) or not len(lo):
+        return np.full(len(wanted), -1, np.int64)
+    n = int(max(hi.max(), wanted.max())) + 1
+    keys = lo * n + hi
+    order = np.argsort(keys, kind="stable")
+    key = wanted.min(axis=1) * n + wanted.max(axis=1)
+    at = np.minimum(np.searchsorted(keys, key, sorter=order), len(keys) - 1)
+    rows: I64 = order[at]
+    return np.where(keys[rows] == key, rows, -1)
+
+
+def _rules(cage: Cage, t: _Topology) -> tuple[F64, F64]:
+    weights, neighbours = np.empty((len(cage.vertices), 2)), np.empty(cage.vertices.shape)
+    creases.vertex_rules(cage.vertices, t.lo, t.hi, t.edges, t.corners, weights, neighbours)
+    return weights, neighbours
 
 
 def _split(cage: Cage, smooth: bool, sharp_corners: bool) -> Cage:
@@ -92,10 +138,9 @@ def _split(cage: Cage, smooth: bool, sharp_corners: bool) -> Cage:
         t.of_corner,
         t.lo,
         t.hi,
-        t.n_faces,
+        t.edges,
         t.valence,
-        t.kind,
-        t.neighbours,
+        *_rules(cage, t),
         smooth,
         vertices,
     )
@@ -108,12 +153,62 @@ def _split(cage: Cage, smooth: bool, sharp_corners: bool) -> Cage:
         quads.reshape(-1),
         corners.reshape(4 * n_corners, -1),
         np.repeat(cage.face, cage.counts),
+        _after_step(cage, t),
     )
+
+
+def _after_step(cage: Cage, t: _Topology) -> Creases:
+    """What is still sharp after a step: both halves of an edge, and vertices."""
+    sharp = cage.creases
+    found = find_edges(t.lo, t.hi, sharp.edges)
+    left, left_of_corners = (
+        np.where(s >= INFINITE, INFINITE, np.maximum(s - 1.0, 0.0)) for s in (sharp.sharpness, sharp.corner_sharpness)
+    )
+    kept, corners = (left > 0) & (found >= 0), left_of_corners > 0
+    middle = len(cage.vertices) + found[kept]
+    halves = [np.stack([sharp.edges[kept, end], middle], axis=1) for end in (0, 1)]
+    return Creases(np.concatenate(halves), np.tile(left[kept], 2), sharp.corners[corners], left_of_corners[corners])
 
 
 def _limit(cage: Cage, sharp_corners: bool) -> F64:
     """Where the vertices of an all-quad mesh end up after infinitely many steps."""
     t = _analyse(cage, sharp_corners)
     limit = np.empty_like(cage.vertices)
-    meshing.limit_vertices(cage.vertices, cage.indices, t.lo, t.hi, t.valence, t.kind, t.neighbours, limit)
+    weights, neighbours = _rules(cage, t)
+    meshing.limit_vertices(cage.vertices, cage.indices, t.lo, t.hi, t.valence, weights, neighbours, limit)
+    fading = np.empty(len(limit), np.bool_)
+    creases.find_fading(t.lo, t.hi, t.edges, t.corners, fading)
+    rows = np.flatnonzero(fading & (t.valence > 0))
+    if len(rows):
+        own = np.flatnonzero(fading[cage.indices])
+        own = own[np.argsort(cage.indices[own], kind="stable")]
+        begin = np.searchsorted(cage.indices[own], np.append(rows, len(limit)))
+        creases.limits_where_fading(
+            cage.vertices, cage.indices, t.of_corner, t.edges, t.corners, t.n_faces, rows, begin, own, limit
+        )
     return limit
+
+
+def smooth_normals(cage: Cage) -> tuple[F64, I64]:
+    """Area-weighted mean of the faces' normals about each vertex, on each side of what is sharp there.
+
+    Returns
+    -------
+    (n, 3) float64, (n_corners,) int64
+        Not unit; and the row of each corner.
+    """
+    starts = np.concatenate([[0], np.cumsum(cage.counts)])
+    group, n = cage.indices, len(cage.vertices)
+    # What will be sharp for less than another step is as round as the faces are small.
+    parted = cage.creases.edges[cage.creases.sharpness >= 1.0]
+    if len(parted):
+        of_corner, lo, hi, n_faces = (np.empty(len(cage.indices), np.int64) for _ in range(4))
+        n_edges = meshing.find_edges(starts, cage.indices, n, of_corner, lo, hi, n_faces)
+        found = find_edges(lo[:n_edges], hi[:n_edges], parted)
+        splits = np.zeros(n_edges, np.bool_)
+        splits[found[found >= 0]] = True
+        group = np.empty_like(cage.indices)
+        n = creases.group_corners(starts, cage.indices, of_corner, n, splits, group)
+    normals = np.empty((n, 3))
+    meshing.vertex_normals(cage.vertices, starts, cage.indices, group, normals)
+    return normals, group

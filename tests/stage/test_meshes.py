@@ -358,10 +358,5 @@ def test_a_primvar_that_does_not_fit_falls_back_with_one_finding(name: str, faul
     assert np.allclose(triangles.normals, [0, 0, 1])
 
 
-def test_creases_and_loop_are_reported_once() -> None:
-    mesh = define(SQUARE, [[0, 1, 2, 3]], "catmullClark")
-    mesh.CreateCreaseIndicesAttr([0, 1])
-    mesh.CreateCreaseLengthsAttr([2])
-    mesh.CreateCreaseSharpnessesAttr([2.5])
-    assert read_reporting(mesh, 1)[1] == [("/mesh", "creases")]
+def test_loop_subdivision_is_reported_once() -> None:
     assert read_reporting(define(SQUARE, [[0, 1, 2], [0, 2, 3]], "loop"), 2)[1] == [("/mesh", "subdivisionScheme loop")]
