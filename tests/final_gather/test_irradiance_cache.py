@@ -79,7 +79,7 @@ def test_gradients_are_the_differences_of_neighbours(how):
     floor = next(i for i, surface in enumerate(SCENE.surfaces) if surface.path == "/floor")
     instance = int(np.flatnonzero(SCENE.geometry.instance_surface == floor)[0])
     first = SCENE.geometry.mesh_begin[SCENE.geometry.instance_mesh[instance]]
-    centre = points_on_surface(SCENE, [instance] * 3, [first] * 3, [[0.3, 0.4], [0.05, 0.85], [0.5, 0.1]], 0)
+    centre = points_on_surface(SCENE, [instance] * 3, [first] * 3, [[0.3, 0.4], [0.55, 0.4], [0.5, 0.1]], 0)
     hemispheres = HemisphereTracer(SCENE, built.tracer, built.gather, settings.n_theta, settings.n_phi, seed=5)
     cache = IrradianceCache(hemispheres, built.cache.cells, settings)
 
@@ -104,7 +104,7 @@ def test_gradients_are_the_differences_of_neighbours(how):
         expected = gradient @ along
         size = here.irradiance.mean()
         np.testing.assert_allclose(found, expected, atol=0.05 * size)
-        assert np.abs(expected).max() > 0.4 * size
+        assert np.abs(expected).max() > 0.25 * size
 
 
 def test_no_record_reaches_beyond_what_its_neighbours_know():
