@@ -44,6 +44,10 @@ class CameraPass:
     ) -> None:
         self._snapshot, self._tracer, self._settings = snapshot, tracer, settings
         self._n, self._n_edge, n = settings.samples_per_pixel, n_edge, settings.samples_per_pixel
+        # A lone sample of a lone image looks through the centre of its pixel.
+        self._centred = settings.first_sample is None and n + n_edge == 1
+        self._first = settings.first_sample or 0
+        self._first_edge = self._first + n if settings.first_edge_sample is None else settings.first_edge_sample
         self._filter = PixelFilter(settings.pixel_filter, settings.filter_width)
         camera = snapshot.camera
         n_pixels = camera.width * camera.height
@@ -57,7 +61,7 @@ class CameraPass:
         """Samples that every pixel has; finds the edges on the way."""
         looks = []
         for number, pixels in enumerate(self.bands):
-            view = self._trace(pixels, self._n, 0)
+            view = self._trace(pixels, self._n, self._first)
             if self._is_kept:
                 self._kept[number] = view
             if self._n_edge:
@@ -71,11 +75,11 @@ class CameraPass:
         for number, pixels in enumerate(self.bands):
             view = self._kept.pop(number, None)
             if view is None:
-                view = self._trace(pixels, self._n, 0)
+                view = self._trace(pixels, self._n, self._first)
             begin, end = np.searchsorted(self._edges, pixels)
             edges = self._edges[begin:end]
             if len(edges):
-                view = _joined(view, self._trace(edges, self._n_edge, self._n), edges)
+                view = _joined(view, self._trace(edges, self._n_edge, self._first_edge), edges)
             yield Band(pixels, view)
 
     def _trace(self, pixels: tuple[int, int] | I64, n: int, first: int) -> ViewSamples:
@@ -83,8 +87,8 @@ class CameraPass:
             self._snapshot,
             self._tracer,
             samples_per_pixel=n,
-            first_sample=first + (self._settings.first_sample or 0),
-            centred=self._settings.first_sample is None and self._n + self._n_edge == 1,
+            first_sample=first,
+            centred=self._centred,
             pixel_filter=self._filter,
             seed=self._settings.seed,
             max_splits=0,

@@ -37,6 +37,7 @@ class GatherSettings:
     #: Number of a pixel's first camera sample, where this image is to be one of several that are added up; None where
     #: it stands alone.
     first_sample: int | None = None
+    first_edge_sample: int | None = None  #: the same for those in pixels with edges; None: after the others
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:

@@ -112,6 +112,7 @@ def _moments(session: Session, settings: GatherSettings) -> Iterator[tuple[float
             samples_per_pixel=moment.samples_per_pixel,
             edge_samples=moment.edge_samples,
             first_sample=moment.first_sample,
+            first_edge_sample=moment.first_edge_sample,
         )
         yield moment.weight, moment.session, effort
 

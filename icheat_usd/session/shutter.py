@@ -2,9 +2,8 @@
 
 Everything moves, as nothing is asked about motion: each moment is a session of
 its own, with its objects, deformations, camera, lights and edits. A pixel's
-camera samples are divided among the moments, so that they are as many as
-without blur, and in the same order: each moment has the next ones of the
-pixel's stratified sequence.
+camera samples are divided among the moments, so that they are the same as
+without blur: each moment has the next ones of the pixel's stratified sequence.
 """
 
 from __future__ import annotations
@@ -29,7 +28,8 @@ class Moment(NamedTuple):
     weight: float  #: of its image; all weights of an image add up to 1
     first_sample: int | None  #: number of the first camera sample of a pixel; None: the moment is the whole image
     samples_per_pixel: int
-    edge_samples: int  #: more of them for pixels with edges, which follow
+    first_edge_sample: int | None  #: the same for those of pixels with edges, which follow all others
+    edge_samples: int
 
 
 def moments(session: Session, samples_per_pixel: int, edge_samples: int = 0, most: int = MOMENTS) -> Iterator[Moment]:
@@ -49,11 +49,11 @@ def moments(session: Session, samples_per_pixel: int, edge_samples: int = 0, mos
     n = min(most, samples_per_pixel)
     interval = _open_shutter(session)
     if interval is None or n < 2:
-        yield Moment(session, 1.0, None, samples_per_pixel, edge_samples)
+        yield Moment(session, 1.0, None, samples_per_pixel, None, edge_samples)
         return
     begin, end = interval
     shared = SharedParts()
-    first_sample, samples, edges = 0, 0, 0
+    done, done_edges, samples, edges = 0, 0, 0, 0
     kept: list[tuple[Session, str]] = []  # the moment in work and the one before it, each with its content
     for k in range(n):
         # What is in the middle of a moment's share of the samples is in the middle of its share of the time.
@@ -63,17 +63,18 @@ def moments(session: Session, samples_per_pixel: int, edge_samples: int = 0, mos
         content = _content(now)
         if not kept or content != kept[-1][1]:
             if kept:
-                yield Moment(kept[-1][0], samples / samples_per_pixel, first_sample, samples, edges)
-                first_sample += samples + edges
-            samples, edges = 0, 0
+                weight = samples / samples_per_pixel
+                yield Moment(kept[-1][0], weight, done, samples, samples_per_pixel + done_edges, edges)
+            done, done_edges, samples, edges = done + samples, done_edges + edges, 0, 0
             kept = [*kept[-1:], (now, content)]
         samples += share
         edges += _part(edge_samples, k, n)
     last, content = kept[-1]
     if samples < samples_per_pixel:
-        yield Moment(last, samples / samples_per_pixel, first_sample, samples, edges)
+        weight = samples / samples_per_pixel
+        yield Moment(last, weight, done, samples, samples_per_pixel + done_edges, edges)
     else:
-        yield Moment(session if _content(session) == content else last, 1.0, None, samples, edges)
+        yield Moment(session if _content(session) == content else last, 1.0, None, samples, None, edges)
 
 
 def _part(total: int, k: int, n: int) -> int:

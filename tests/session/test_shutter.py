@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender
 
+from icheat_usd.final_gather import GatherSettings
 from icheat_usd.samples import view_samples
 from icheat_usd.scene import F64
 from icheat_usd.session import Session
@@ -71,14 +72,44 @@ def coverage(session: Session, samples_per_pixel: int, most: int = 8) -> F64:
     return total.reshape(HEIGHT, WIDTH).mean(axis=0)
 
 
+def ramp() -> F64:
+    """Share of the wall in each column, meant over the pixel and the time that the shutter is open."""
+    x = -HALF + 2 * HALF / WIDTH * (np.arange(WIDTH * 64) + 0.5) / 64
+    begin, end = (SPEED * t for t in SHUTTER)
+    share: F64 = np.clip((end - x) / (end - begin), 0, 1).reshape(WIDTH, 64).mean(axis=1)
+    return share
+
+
 @pytest.mark.parametrize("how", ["xform", "points", "camera"])
 def test_a_moving_edge_covers_pixels_by_the_time_it_is_before_them(how: str) -> None:
     seen = coverage(opened(moving_stage(how)), 64, most=32)
-    x = -HALF + 2 * HALF / WIDTH * (np.arange(WIDTH * 64) + 0.5) / 64
-    begin, end = (SPEED * t for t in SHUTTER)
-    expected = np.clip((end - x) / (end - begin), 0, 1).reshape(WIDTH, 64).mean(axis=1)
+    expected = ramp()
     assert ((expected > 0) & (expected < 1)).sum() == 12  # three eighths of the picture
     np.testing.assert_allclose(seen, expected, atol=0.02)
+
+
+def test_a_render_of_what_moves_is_the_mean_over_the_shutter() -> None:
+    stage = moving_stage("xform")
+    UsdLux.DomeLight.Define(stage, "/sky").CreateIntensityAttr(1.0)
+    UsdGeom.Mesh(stage.GetPrimAtPath("/wall")).CreateDisplayColorAttr([(0.5, 0.5, 0.5)])
+    for method in ("brute", "cached"):
+        effort = GatherSettings(samples_per_pixel=64, edge_samples=16, gather_rays=1, light_samples=8, method=method)
+        film = opened(stage).render(effort)
+        # White sky behind the wall, which sees all of it and reflects half: a pixel tells how much wall is in it.
+        seen = 2 * (1 - film.layers["beauty"][..., 0].astype(np.float64).mean(axis=0))
+        assert np.abs(np.diff(seen)).max() < 0.2
+        np.testing.assert_allclose(seen, ramp(), atol=0.07)
+
+
+def test_a_render_without_motion_is_bit_for_bit_that_of_a_closed_shutter() -> None:
+    effort = GatherSettings(samples_per_pixel=4, gather_rays=1, light_samples=1, method="brute")
+    films = []
+    for stage in (moving_stage("nothing"), moving_stage("nothing", (0.0, 0.0)), moving_stage("xform", (0.0, 0.0))):
+        UsdLux.DomeLight.Define(stage, "/sky")
+        films.append(opened(stage).render(effort))
+    for name, values in films[0].layers.items():
+        for other in films[1:]:
+            assert np.array_equal(values, other.layers[name]), name
 
 
 def test_samples_are_divided_among_the_moments_and_all_are_used() -> None:
@@ -91,12 +122,13 @@ def test_samples_are_divided_among_the_moments_and_all_are_used() -> None:
         assert sum(part.edge_samples for part in parts) == edges
         assert [part.weight for part in parts] == [part.samples_per_pixel / total for part in parts]
         numbers = [
-            number
+            n
             for part in parts
-            for number in range(
-                part.first_sample or 0, (part.first_sample or 0) + part.samples_per_pixel + part.edge_samples
-            )
+            for n in range(part.first_sample or 0, (part.first_sample or 0) + part.samples_per_pixel)
         ]
+        for part in parts:
+            assert part.first_edge_sample is not None
+            numbers += range(part.first_edge_sample, part.first_edge_sample + part.edge_samples)
         assert numbers == list(range(total + edges))
         # Each looks at the middle of as much of the time as it has of the samples.
         before = np.cumsum([0, *(part.samples_per_pixel for part in parts)])
@@ -124,7 +156,7 @@ def test_without_motion_there_is_one_moment_the_session_itself() -> None:
         session = opened(stage)
         (only,) = moments(session, 8, 4)
         assert only.session is session
-        assert (only.weight, only.first_sample, only.samples_per_pixel, only.edge_samples) == (1.0, None, 8, 4)
+        assert only == (session, 1.0, None, 8, None, 4)
     (only,) = moments(opened(moving_stage("xform")), 1)
     assert only.first_sample is None
 
