@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from icheat_usd.final_gather import GatherSettings
 from icheat_usd.samples import view_samples
 from icheat_usd.scene import F64
 from icheat_usd.session import Session
+from icheat_usd.session.quality import DRAFT
 from icheat_usd.session.shutter import moments
 
 WIDTH, HEIGHT = 32, 4
@@ -53,7 +55,8 @@ def moving_stage(how: str, shutter: tuple[float, float] = SHUTTER) -> Usd.Stage:
 
 
 def opened(stage: Usd.Stage, frame: float = 5.0) -> Session:
-    return Session.open(stage, camera="/camera", frame=frame, width=WIDTH, height=HEIGHT)
+    quality = replace(DRAFT, n_gather=256, rays_per_bounce_row=16)
+    return Session.open(stage, camera="/camera", frame=frame, width=WIDTH, height=HEIGHT, quality=quality)
 
 
 def coverage(session: Session, samples_per_pixel: int, most: int = 8) -> F64:
