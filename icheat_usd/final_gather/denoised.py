@@ -1,0 +1,75 @@
+"""Denoising of a final gather."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from icheat_usd.final_gather.extras import Extras
+from icheat_usd.final_gather.integrator import FinalGather
+from icheat_usd.image.cryptomatte import name_id
+from icheat_usd.image.denoise import EditImage, denoise, denoise_edited
+from icheat_usd.progress import Progress, silent
+from icheat_usd.scene import F32, F64
+
+
+def with_denoising(extras: Extras) -> Extras:
+    """Extras and all that `denoised` needs."""
+    return replace(extras, contributions=True, objects=True, edits=True)
+
+
+def denoised(result: FinalGather, edits: Sequence[str], *, progress: Progress = silent) -> FinalGather:
+    """A final gather without its noise: direct light, indirect light, what edits contribute and light groups.
+
+    The unedited light does not depend on the edits; where no edit has a mask above 0, edited light has its bits. Light
+    groups are denoised one by one, so that they sum to the direct light only about.
+
+    Parameters
+    ----------
+    result : FinalGather
+        Rendered `with_denoising`.
+    edits : sequence of str
+        Paths of the stack's active edits, weakest first.
+
+    Raises
+    ------
+    ImageError
+        Open Image Denoise is not installed, or fails.
+    ValueError
+        The result lacks coverage of objects or edits.
+    """
+    if not {"object", "edit"} <= result.coverage.keys():
+        raise ValueError("a final gather can only be denoised if it was rendered with the extras of with_denoising()")
+    progress("denoise", 0.0)
+    albedo, normal = (np.ascontiguousarray(layer, np.float32) for layer in (result.albedo, result.normal))
+
+    def clean(layer: F64) -> F64:
+        return denoise(layer.astype(np.float32), albedo, normal).astype(np.float64)
+
+    there = [path for path in edits if path in result.contributions]
+    images = [EditImage(mask_image(result, path), result.contributions[path].astype(np.float32)) for path in there]
+    light = denoise_edited(result.indirect.astype(np.float32), images, albedo, normal)
+    changes = dict(zip(there, light.changes, strict=True))
+    found = replace(
+        result,
+        direct=clean(result.direct),
+        indirect=light.unedited.astype(np.float64),
+        indirect_edited=light.edited.astype(np.float64),
+        contributions={path: changes.get(path, old).astype(np.float64) for path, old in result.contributions.items()},
+        light_groups={name: clean(layer) for name, layer in result.light_groups.items()},
+    )
+    progress("denoise", 1.0)
+    return found
+
+
+def mask_image(result: FinalGather, edit: str) -> F32:
+    """Receiver mask of an edit, (height, width), averaged over the surfaces that each pixel shows."""
+    height, width, _ = result.indirect.shape
+    shown, covered = result.coverage["object"], result.coverage["edit"]
+    surfaces = np.bincount(shown.pixel, shown.share, height * width)
+    mine = covered.id == name_id(edit)
+    mask = np.bincount(covered.pixel[mine], covered.share[mine], height * width)
+    mask = np.divide(mask, surfaces, out=np.zeros_like(mask), where=surfaces > 0)
+    return np.minimum(mask, 1.0).reshape(height, width).astype(np.float32)
