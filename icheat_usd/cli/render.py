@@ -50,6 +50,12 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
         help="cached: irradiance is interpolated where it is smooth; brute: every camera sample gathers for itself, "
         "slow and unbiased",
     )
+    parser.add_argument(
+        "--photons", action="store_true", help="earlier bounces by a photon map instead of the gather samples"
+    )
+    parser.add_argument(
+        "--denoise", action="store_true", help="with Open Image Denoise: pip install 'icheat-usd[denoise]'"
+    )
     parser.add_argument("--rays", type=positive, metavar="N", help="gather rays where no light is cached")
     parser.add_argument("--bounces", type=positive, metavar="N", help="diffuse reflections before the last one")
 
@@ -73,6 +79,8 @@ def command(options: argparse.Namespace) -> int:
         "pixel_filter": options.filter,
         "filter_width": options.filter_width,
         "method": options.method,
+        "bounces": "photons" if options.photons else None,
+        "denoise": options.denoise or None,
     }
     chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     return render_frames(options, replace(GatherSettings(seed=options.seed), **chosen))

@@ -1,5 +1,6 @@
 """The final gather: the frame that ships, with edits evaluated where rays really land."""
 
+from icheat_usd.final_gather.denoised import denoised, with_denoising
 from icheat_usd.final_gather.extras import NO_EXTRAS, Extras
 from icheat_usd.final_gather.integrator import FinalGather, final_gather
 from icheat_usd.final_gather.irradiance_cache import CacheSettings
@@ -12,6 +13,8 @@ __all__ = [
     "Extras",
     "FinalGather",
     "GatherSettings",
+    "denoised",
     "final_gather",
     "weighted_gather",
+    "with_denoising",
 ]

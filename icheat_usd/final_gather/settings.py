@@ -8,6 +8,7 @@ from icheat_usd.final_gather.irradiance_cache import CacheSettings
 from icheat_usd.samples.pixel_filter import PixelFilter
 
 METHODS = ("cached", "brute")
+BOUNCES = ("cells", "photons")
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,14 @@ class GatherSettings:
     first_sample: int | None = None
     first_edge_sample: int | None = None  #: the same for those in pixels with edges; None: after the others
 
+    #: How earlier bounces are solved, where no paths are followed for them: "cells" by the exchange of light between
+    #: gather samples, "photons" by light traced forwards.
+    bounces: str = "cells"
+    denoise: bool = False  #: by Open Image Denoise, which must be installed
+
     def __post_init__(self) -> None:
+        if self.bounces not in BOUNCES:
+            raise ValueError(f"bounces '{self.bounces}' is none of {', '.join(BOUNCES)}")
         if self.method not in METHODS:
             raise ValueError(f"method '{self.method}' is none of {', '.join(METHODS)}")
         if self.samples_per_pixel < 1 or self.edge_samples < 0:

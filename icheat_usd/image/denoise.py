@@ -9,7 +9,7 @@ multiplied by the mask again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,24 @@ class Denoised(NamedTuple):
     changes: tuple[F32, ...]  #: (height, width, 3) of each edit
 
 
+def denoiser() -> Any:
+    """The package that denoises.
+
+    Raises
+    ------
+    ImageError
+        It is not installed.
+    """
+    try:
+        import pyoidn
+    except (ImportError, OSError) as error:
+        raise ImageError(
+            f"denoising needs Open Image Denoise, which cannot be used here ({error}); install it with "
+            "pip install 'icheat-usd[denoise]', or render without denoising"
+        ) from None
+    return pyoidn
+
+
 def denoise(color: F32, albedo: F32 | None = None, normal: F32 | None = None) -> F32:
     """An image without its noise; the same bits every time, with any number of threads.
 
@@ -59,13 +77,7 @@ def denoise(color: F32, albedo: F32 | None = None, normal: F32 | None = None) ->
     ImageError
         Open Image Denoise is not installed or fails, or the images differ in size.
     """
-    try:
-        import pyoidn
-    except (ImportError, OSError) as error:
-        raise ImageError(
-            f"denoising needs Open Image Denoise, which cannot be used here ({error}); install it with "
-            "pip install 'icheat-usd[denoise]', or render without denoising"
-        ) from None
+    pyoidn = denoiser()
     if normal is not None and albedo is None:
         raise ImageError("denoising uses normals only together with albedo; give both or neither")
     for name, image in (("albedo", albedo), ("normal", normal)):

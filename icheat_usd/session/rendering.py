@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.model import EditStack
 from icheat_usd.errors import ImageError
-from icheat_usd.final_gather import Extras, FinalGather, GatherSettings, final_gather, weighted_gather
+from icheat_usd.final_gather import (
+    Extras,
+    FinalGather,
+    GatherSettings,
+    denoised,
+    final_gather,
+    weighted_gather,
+    with_denoising,
+)
 from icheat_usd.image.colour import configuration_id
+from icheat_usd.image.denoise import denoiser
 from icheat_usd.image.exr import write_exr
 from icheat_usd.image.film import Film
 from icheat_usd.image.png import write_png
@@ -57,15 +66,21 @@ def render_film(session: Session, settings: GatherSettings, layers: Sequence[lay
     Raises
     ------
     ImageError
-        A layer is of a light or an edit that is not there at this frame.
+        A layer is of a light or an edit that is not there at this frame; or the denoiser is not there.
     """
+    if settings.denoise:
+        denoiser()  # before hours of work
     stack = session.stack
     scene = aovs.layer_scene(session.snapshot, stack)
     members = aovs.expanded(layers, scene)
     extras = aovs.needed(members, scene)
+    if settings.denoise:
+        extras = with_denoising(extras)
     result = weighted_gather(
         (weight, _gather(moment, effort, extras)) for weight, moment, effort in _moments(session, settings)
     )
+    if settings.denoise:
+        result = denoised(result, [edit.path for edit in stack.active], progress=session.progress)
     return aovs.make_film(result, members, scene, session.snapshot, _metadata(session, settings, stack))
 
 
@@ -121,7 +136,8 @@ def _gather(session: Session, settings: GatherSettings, extras: Extras) -> Final
     field = bind(session.stack, session.snapshot)
     gather, radiance = None, None
     if settings.method == "cached" or field.uses_incident or field.has_offset:
-        gather, radiance = session.gather, session.cell_light.radiance
+        light = session.photon_light if settings.bounces == "photons" else session.cell_light
+        gather, radiance = session.gather, light.radiance
     return final_gather(
         session.snapshot,
         session.tracer,

@@ -9,10 +9,13 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any, Protocol, TypeVar, cast
 
+from icheat_usd.final_gather.photon_map import photon_cell_radiance
+from icheat_usd.final_gather.photons import PhotonSettings
+from icheat_usd.lighting import build_light_sampler
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight import Relighter
 from icheat_usd.relight.relighter import light_view
-from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
+from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct, gather_samples, view_samples
 from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.session.content_keys import ShotKeys, shot_keys
 from icheat_usd.session.disk_cache import DiskCache, Shelf
@@ -235,6 +238,18 @@ class ShotParts:
             )
 
         return self._kept("cell_light", ("bounces",), make)
+
+    @cached_property
+    def photon_light(self) -> CellLight:
+        """The same light, its bounces after the first by photons."""
+        quality = self.quality
+        settings = PhotonSettings(n_bounces=quality.n_bounces, seed=quality.seed)
+        sampler = build_light_sampler(self.snapshot, self.tracer, self.gather.patch_points, quality.seed)
+        direct = cell_direct(self.snapshot, self.tracer, sampler, self.gather, quality.light_samples, quality.seed)
+        radiance = photon_cell_radiance(
+            self.snapshot, self.tracer, self.gather, direct, settings, progress=self.progress
+        )
+        return CellLight(direct, radiance)
 
     @cached_property
     def view_light(self) -> F32:

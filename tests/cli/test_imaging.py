@@ -81,3 +81,21 @@ def test_an_interrupted_render_leaves_nothing_behind(tmp_path: Path) -> None:
     assert process.returncode == 130, started + rest
     assert "interrupted" in rest and "Traceback" not in rest
     assert list(tmp_path.iterdir()) == []
+
+
+def test_photons_and_the_denoiser_are_a_choice(tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn")
+    films = {}
+    for name, flags in {"plain": [], "photons": ["--photons"], "denoised": ["--denoise"]}.items():
+        out = tmp_path / f"{name}.exr"
+        assert main(["render", BOX, *QUICK, "--samples", "2", "--edge-samples", "0", *flags, "-o", str(out)]) == 0
+        films[name] = read_exr(out)
+    for layer in ("indirect", "indirect_edited", "beauty"):
+        plain, photons, denoised = (film.layer(layer) for film in films.values())
+        assert not np.array_equal(plain, photons)
+        assert photons.mean() == pytest.approx(plain.mean(), rel=0.05)
+        assert not np.array_equal(plain, denoised)
+        assert denoised.mean() == pytest.approx(plain.mean(), rel=0.05)
+    same = films["denoised"].layer("indirect") == films["denoised"].layer("indirect_edited")
+    changed = films["plain"].layer("edit_delta") != 0
+    assert same[~changed.any(axis=2)].all()
