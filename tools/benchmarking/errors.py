@@ -324,7 +324,8 @@ def one_light_of(parts: Parts, light: int) -> Any:
         size=lights.size[kept], texture=lights.texture[kept], surface=lights.surface[kept],
         triangle_begin=np.zeros(2, np.int64),
     )  # fmt: skip
-    return replace(parts.snapshot, lights=alone, light_paths=parts.snapshot.light_paths[kept])
+    whole = parts.snapshot
+    return replace(whole, lights=alone, light_paths=whole.light_paths[kept], light_controls=whole.light_controls[kept])
 
 
 def _images(parts: Parts, references: References, settings: ErrorSettings, names: list[str], folder: Path) -> list[str]:

@@ -130,7 +130,9 @@ def _with_lights(parts: Parts, n: int) -> Parts:
         triangle_instance=none.triangle_instance[:0],
     )
     dark = TestLight("dome", LightKind.DOME, np.eye(3, 4), (0.0, 0.0, 0.0), image=np.ones((2, 4, 3), np.float32))
-    return parts.under(add_lights(replace(parts.snapshot, lights=empty, light_paths=()), [*balls, dark]))
+    return parts.under(
+        add_lights(replace(parts.snapshot, lights=empty, light_paths=(), light_controls=()), [*balls, dark])
+    )
 
 
 def _steps(scene: Scene) -> dict[str, Callable[[int], Any]]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from icheat_usd.materials import shade_hits, take_points
 from icheat_usd.samples import ViewSamples
-from icheat_usd.scene import F32, F64, LightKind, Lights, SceneSnapshot, SurfacePoints, Textures
+from icheat_usd.scene import F32, F64, PLAIN, LightKind, Lights, SceneSnapshot, SurfacePoints, Textures
 from icheat_usd.tracing import Tracer, spawn_points
 
 _PILOT = 4096  # places that the view receives light from
@@ -70,7 +70,7 @@ def with_lights(snapshot: SceneSnapshot, lights: list[TestLight]) -> SceneSnapsh
         triangle=np.zeros(0, np.int32),
         triangle_instance=np.zeros(0, np.int32),
     )
-    return add_lights(replace(snapshot, lights=none, light_paths=()), lights)
+    return add_lights(replace(snapshot, lights=none, light_paths=(), light_controls=()), lights)
 
 
 def add_lights(snapshot: SceneSnapshot, lights: list[TestLight]) -> SceneSnapshot:
@@ -105,6 +105,7 @@ def add_lights(snapshot: SceneSnapshot, lights: list[TestLight]) -> SceneSnapsho
         lights=table,
         textures=Textures(texels, begin, width, height, wrap),
         light_paths=(*snapshot.light_paths, *(f"/TestLights/{light.name}" for light in lights)),
+        light_controls=snapshot.light_controls and (*snapshot.light_controls, *(PLAIN for _ in lights)),
     )
 
 

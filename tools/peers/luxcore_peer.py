@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from icheat_usd.scene import F64, LightKind, SceneSnapshot
-from tools.peers.mitsuba_peer import Part, world_parts
+from tools.peers.mitsuba_peer import Part, refuse_controls, world_parts
 
 #: Radius of a look-up of the cache, in radii of the scene, and how many records it may have.
 _LOOKUP_RADIUS, _MOST_RECORDS = 0.06, 100_000
@@ -44,6 +44,7 @@ class LuxCoreScene:
         self._set({"scene.materials.painted.type": "matte", "scene.materials.painted.kd": "own"})
         for material, part in world_parts(snapshot).items():
             self._add_part(material, part)
+        refuse_controls(snapshot)
         for light in range(len(snapshot.lights.kind)):
             self._add_light(light)
 

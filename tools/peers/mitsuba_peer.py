@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.materials import points_on_surface
-from icheat_usd.scene import F32, F64, I64, LightKind, SceneSnapshot, Texture
+from icheat_usd.scene import F32, F64, I64, PLAIN, LightKind, SceneSnapshot, Texture
 
 #: Longest path that Mitsuba follows, in segments: camera to surface is 1, on to a light 2.
 EMISSION, DIRECT, ONE_BOUNCE = 1, 2, 3
@@ -91,7 +91,16 @@ def with_lights(snapshot: SceneSnapshot, keep: list[int]) -> SceneSnapshot:
         triangle=np.ascontiguousarray(lights.triangle[rows]),
         triangle_instance=np.ascontiguousarray(lights.triangle_instance[rows]),
     )
-    return replace(snapshot, lights=kept, light_paths=tuple(snapshot.light_paths[k] for k in order))
+    controls = tuple(snapshot.controls(k) for k in order) if snapshot.light_controls else ()
+    paths = tuple(snapshot.light_paths[k] for k in order)
+    return replace(snapshot, lights=kept, light_paths=paths, light_controls=controls)
+
+
+def refuse_controls(snapshot: SceneSnapshot) -> None:
+    """Raise a ValueError for lights that are linked, shaped or multiplied, which no peer does alike."""
+    for path, controls in zip(snapshot.light_paths, snapshot.light_controls, strict=bool(snapshot.light_controls)):
+        if controls is not PLAIN:
+            raise ValueError(f"light {path} is linked, shaped or has multipliers, which peers do not get; leave it out")
 
 
 def mitsuba_scene(mi: Any, snapshot: SceneSnapshot) -> Any:
@@ -105,6 +114,7 @@ def mitsuba_scene(mi: Any, snapshot: SceneSnapshot) -> Any:
     scene: dict[str, Any] = {"type": "scene"}
     for material, part in world_parts(snapshot).items():
         scene.update(_meshes(mi, snapshot, material, part))
+    refuse_controls(snapshot)
     for light in range(len(snapshot.lights.kind)):
         scene.update(_light(mi, snapshot, light))
     return mi.load_dict(scene)
