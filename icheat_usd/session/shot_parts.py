@@ -33,6 +33,9 @@ Part = TypeVar("Part")
 #: Records that any image may have, however small it is.
 FEWEST_RECORDS = 8_192
 
+#: Photons that leave lights, for each gather sample.
+PHOTONS_PER_CELL = 16
+
 #: What takes less time to make than this is not kept on disk: reading it back would take as long.
 WORTH_KEEPING_SECONDS = 1.0
 
@@ -243,7 +246,8 @@ class ShotParts:
     def photon_light(self) -> CellLight:
         """The same light, its bounces after the first by photons."""
         quality = self.quality
-        settings = PhotonSettings(n_bounces=quality.n_bounces, seed=quality.seed)
+        n_emitted = PHOTONS_PER_CELL * self.gather.n
+        settings = PhotonSettings(n_emitted, n_bounces=quality.n_bounces, seed=quality.seed)
         sampler = build_light_sampler(self.snapshot, self.tracer, self.gather.patch_points, quality.seed)
         direct = cell_direct(self.snapshot, self.tracer, sampler, self.gather, quality.light_samples, quality.seed)
         radiance = photon_cell_radiance(

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icheat_usd.cli import main
+from icheat_usd.cli import main, sequence
 from icheat_usd.image.exr import read_exr
 from icheat_usd.resources import resource_path
+from icheat_usd.session import GatherSettings
 
 BOX = str(resource_path("sample_stages/cornell_box/shot.usda"))
 ANIMATED = str(resource_path("sample_stages/animated_room/shot.usda"))
@@ -83,19 +84,14 @@ def test_an_interrupted_render_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_photons_and_the_denoiser_are_a_choice(tmp_path: Path) -> None:
-    pytest.importorskip("pyoidn")
-    films = {}
-    for name, flags in {"plain": [], "photons": ["--photons"], "denoised": ["--denoise"]}.items():
-        out = tmp_path / f"{name}.exr"
-        assert main(["render", BOX, *QUICK, "--samples", "2", "--edge-samples", "0", *flags, "-o", str(out)]) == 0
-        films[name] = read_exr(out)
-    for layer in ("indirect", "indirect_edited", "beauty"):
-        plain, photons, denoised = (film.layer(layer) for film in films.values())
-        assert not np.array_equal(plain, photons)
-        assert photons.mean() == pytest.approx(plain.mean(), rel=0.05)
-        assert not np.array_equal(plain, denoised)
-        assert denoised.mean() == pytest.approx(plain.mean(), rel=0.05)
-    same = films["denoised"].layer("indirect") == films["denoised"].layer("indirect_edited")
-    changed = films["plain"].layer("edit_delta") != 0
-    assert same[~changed.any(axis=2)].all()
+def test_photons_and_the_denoiser_are_flags_of_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[GatherSettings] = []
+
+    def note(options: object, settings: GatherSettings) -> int:
+        chosen.append(settings)
+        return 0
+
+    monkeypatch.setattr(sequence, "render_frames", note)
+    for flags in ([], ["--photons"], ["--denoise"]):
+        assert main(["render", BOX, "-o", "x.exr", *flags]) == 0
+    assert [(one.bounces, one.denoise) for one in chosen] == [("cells", False), ("photons", False), ("cells", True)]
