@@ -18,14 +18,15 @@ from icheat_usd.session import Quality, Session, layer_names
 from icheat_usd.session.products import product_output
 from icheat_usd.session.rendering import Output, write_outputs
 from icheat_usd.stage import open_stage
-from icheat_usd.stage.render_products import read_render_products
+from icheat_usd.stage.render_products import RenderProduct, read_render_products
 
 
 @dataclass(frozen=True)
 class _View:
     """Files of one frame that show the same."""
 
-    product: str | None  #: RenderProduct that says what the camera is
+    product: str | None  #: RenderProduct that says what the image is like
+    camera: str | None  #: that it names itself: it decides which edit stack is meant
     outputs: tuple[Output, ...]
 
 
@@ -76,7 +77,7 @@ def _render(
     began = time.perf_counter()
     session = Session.open(
         stage,
-        camera=options.camera,
+        camera=options.camera or view.camera,
         frame=frame,
         stack=options.stack,
         width=options.width,
@@ -107,14 +108,18 @@ def _views(
     options: argparse.Namespace, stage: Any, frame: float | None, n_frames: int, found: dict[Any, None]
 ) -> tuple[_View, ...]:
     if options.out and options.product is None:
+        if options.aov and all(name.lower().endswith(".png") for name in options.out):
+            raise ImageError("--aov is for .exr files; choose what a .png shows with --show")
         layers = _layers(options.aov or layer_names.DEFAULT, "--aov")
-        return (_View(None, tuple(_output(options, pattern, layers, frame, n_frames) for pattern in options.out)),)
+        return (
+            _View(None, None, tuple(_output(options, pattern, layers, frame, n_frames) for pattern in options.out)),
+        )
     if options.aov:
         raise ImageError("--aov goes with -o FILE; products name their layers in orderedVars")
     products, findings = read_render_products(stage, frame, options.product)
     found |= dict.fromkeys(findings)
     # Those that differ in nothing that decides the camera's rays are rendered at once.
-    grouped: dict[tuple[object, ...], list[tuple[str, Output]]] = {}
+    grouped: dict[tuple[object, ...], list[tuple[RenderProduct, Output]]] = {}
     for product in products:
         made, more = product_output(product)
         found |= dict.fromkeys(more)
@@ -125,8 +130,10 @@ def _views(
             path = output_path(pattern, frame, n_frames if options.out else 1, where)
             output = replace(made, path=path, view=options.view, exposure=options.exposure)
             output = replace(output, multipart=not options.single_part)
-            grouped.setdefault(product.views, []).append((product.path, output))
-    return tuple(_View(group[0][0], tuple(output for _, output in group)) for group in grouped.values())
+            grouped.setdefault(product.views, []).append((product, output))
+    return tuple(
+        _View(group[0][0].path, group[0][0].camera, tuple(output for _, output in group)) for group in grouped.values()
+    )
 
 
 def _output(

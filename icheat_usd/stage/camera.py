@@ -26,6 +26,7 @@ class RenderChoices:
     depth_of_field: bool = True
     motion_blur: bool = True
     material_purpose: str = "full"
+    purposes: tuple[str, ...] = ("default", "render")
 
 
 def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode, product: str | None = None) -> RenderChoices:
@@ -64,6 +65,7 @@ def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode, product: str | Non
         # The second is the first one's name in older stages.
         motion_blur=not (first("disableMotionBlur", False) or first("instantaneousShutter", False)),
         material_purpose=next((str(purpose) for purpose in purposes if purpose), ""),  # type: ignore[attr-defined]
+        purposes=tuple(map(str, first("includedPurposes", RenderChoices.purposes))),  # type: ignore[call-overload]
     )
 
 

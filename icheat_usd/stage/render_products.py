@@ -17,6 +17,9 @@ from icheat_usd.stage.reporting import Reporter
 #: The name that a Hydra render delegate gives a variable in the product, where it is authored.
 AOV_NAME = "driver:parameters:aov:name"
 
+#: Names of the colour space that light is computed in.
+_COLOR_SPACES = ("lin_rec709_scene", "lin_rec709", "lin_srgb")
+
 _DRIVER = "driver:parameters:"
 _SCALARS = ("half", "float", "double")
 _TRIPLES = re.compile(r"(color|vector|normal|point)3[hfd]|(half|float|double)3")
@@ -41,6 +44,7 @@ class RenderProduct:
     path: str
     file: str  #: productName, a relative one resolved against the folder of the stage; may hold #### for the frame
     variables: tuple[RenderVariable, ...]
+    camera: str | None  #: that the product itself names, not its settings
     views: tuple[object, ...]  #: what decides the camera's rays: products that are equal here share them
 
 
@@ -68,6 +72,9 @@ def read_render_products(
     paths = list(settings.GetProductsRel().GetForwardedTargets()) if settings else []
     if only is not None:
         paths = [_product_path(stage, only)]
+    space = settings.GetRenderingColorSpaceAttr() if settings else None
+    if space and space.HasAuthoredValue() and space.Get(when) not in (None, "", *_COLOR_SPACES):
+        report(settings, "renderingColorSpace", f"'{space.Get(when)}' is not supported; light is linear Rec.709.")
     products = []
     for path in paths:
         product = UsdRender.Product(stage.GetPrimAtPath(path))
@@ -122,7 +129,9 @@ def _read_product(
     window = _first(bases, "dataWindowNDC", when)
     if window is not None and tuple(window) != (0, 0, 1, 1):
         report(path, "dataWindowNDC", f"{tuple(window)} is not supported; the whole image is rendered.")
-    return RenderProduct(str(path), str(file), tuple(variables), _views(bases, when))
+    cameras = product.GetCameraRel().GetForwardedTargets()
+    own = str(cameras[0]) if cameras else None
+    return RenderProduct(str(path), str(file), tuple(variables), own, _views(bases, when))
 
 
 def _read_variable(variable: UsdRender.Var, when: Usd.TimeCode, report: Reporter) -> RenderVariable:

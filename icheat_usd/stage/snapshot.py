@@ -35,7 +35,7 @@ def take_snapshot(
     width: int | None = None,
     height: int | None = None,
     subdivision_level: int = 2,
-    purposes: Sequence[str] = ("default", "render"),
+    purposes: Sequence[str] | None = None,
     product: str | None = None,
     progress: Progress = silent,
 ) -> SceneSnapshot:
@@ -55,7 +55,7 @@ def take_snapshot(
     subdivision_level
         Steps of subdivision surfaces.
     purposes
-        Purposes that are shown.
+        Purposes that are shown; by default the render settings' included ones, else "default" and "render".
     product
         Path of the RenderProduct whose opinions about the image count; the render settings' first one by default.
     progress
@@ -85,7 +85,8 @@ def take_snapshot(
         progress("reading the stage", 0.0)
         found = walk(stage.GetPseudoRoot(), report)
         materials = MaterialLibrary(stage, when)
-        builder = GeometryBuilder(when, materials, subdivision_level, purposes, choices.material_purpose, report)
+        shown_purposes = choices.purposes if purposes is None else purposes
+        builder = GeometryBuilder(when, materials, subdivision_level, shown_purposes, choices.material_purpose, report)
         gprims = [prim for prim in found.gprims if builder.is_shown(prim)]
         progress("reading the stage", 0.2)
         builder.place_prims(gprims, builder.add_meshes(gprims))

@@ -177,6 +177,18 @@ def test_a_mistake_is_one_line_before_anything_is_rendered(
     assert not list(tmp_path.glob("*.exr"))
 
 
+def test_a_product_with_a_camera_of_its_own_has_that_cameras_edits(tmp_path: Path) -> None:
+    other = STAGE[STAGE.index("    def Camera") : STAGE.index("def Scope")].rstrip().removesuffix("}")
+    side = other.replace('"Camera"', '"Side"').replace("(0, 0, 1.9)", "(0.5, 0, 1.9)")
+    stage = stage_with(tmp_path, product("A", "a.exr", "Depth", more="rel camera = </World/Side>"), listed="A")
+    stage.write_text(stage.read_text().replace(other, other + side))
+    for name, camera in (("SideEdits", "/World/Side"), ("MainEdits", "/World/Camera")):
+        assert main(["stack", "create", str(stage), name, "--camera", camera]) == 0
+    assert render(stage) == 0
+    about = read_exr(tmp_path / "a.exr").metadata
+    assert (about["camera"], about["stack"]) == ("/World/Side", "/World/SideEdits")
+
+
 def test_a_png_product_shows_its_first_variable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stage = stage_with(tmp_path, product("A", "a.png", "Indirect", "Beauty"), listed="A")
     capsys.readouterr()

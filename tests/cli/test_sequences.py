@@ -124,6 +124,13 @@ def test_no_frame_keeps_another_one_in_memory(shot: Path, monkeypatch: pytest.Mo
     assert alive == [0, 0, 0]
 
 
+def test_layers_are_not_asked_of_a_png(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", str(shot), "-o", str(shot.parent / "f.png"), "--aov", "depth", *QUICK]) == 2
+    assert "--aov is for .exr files" in capsys.readouterr().err
+    assert main(["render", str(shot), "-o", str(shot.parent / "f.png"), "--show", "crypto_object", *QUICK]) == 2
+    assert "--show crypto_object: is no image" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

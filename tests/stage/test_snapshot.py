@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender, UsdShade
 
 from icheat_usd.errors import StageError
 from icheat_usd.scene import SceneSnapshot
@@ -115,6 +115,10 @@ def test_hidden_inactive_and_guide_prims_are_not_shown() -> None:
     assert [s.path for s in take_snapshot(stage).surfaces] == ["/world/ball"]
     shown = take_snapshot(stage, purposes=("default", "proxy"))
     assert [s.path for s in shown.surfaces] == ["/world/ball", "/world/proxy"]
+    settings = UsdRender.Settings.Define(stage, "/Render")
+    settings.CreateIncludedPurposesAttr().Set(["default", "guide"])
+    stage.SetMetadata("renderSettingsPrimPath", "/Render")
+    assert [s.path for s in take_snapshot(stage).surfaces] == ["/world/ball", "/world/guide"]
 
 
 def test_visibility_transforms_and_points_are_those_of_the_time() -> None:
