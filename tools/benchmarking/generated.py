@@ -1,4 +1,4 @@
-"""A room whose floor has as many triangles as one asks for."""
+"""Stages made for measuring: a room of as many triangles as one asks for, and a wall that is half hidden."""
 
 from __future__ import annotations
 
@@ -62,3 +62,40 @@ def _mesh(
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDisplayColorAttr([Gf.Vec3f(*color)])
     mesh.CreateDoubleSidedAttr(True)
+
+
+#: Light that the wall of `write_screened` reflects, and its size: albedo, cosine of the sun, square metres.
+WALL_ALBEDO, WALL_COSINE, WALL_AREA = 0.6, 1 / 5**0.5, 4.0
+
+
+def write_screened(path: Path) -> Path:
+    """Write a stage: a floor, a wall that a sun without an angle lights, and a black screen that hides half of it.
+
+    The camera sees a part of the floor from where the lower half of the wall is out of sight everywhere.
+    """
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
+    quad = np.array([[0, 1, 2, 3]])
+    floor = np.array([(-1, 0, 1), (1, 0, 1), (1, 0, -1), (-1, 0, -1)])
+    wall = np.array([(-2, 0, 1), (-2, 0, -1), (-2, 2, -1), (-2, 2, 1)])
+    screen = np.array([(-1.2, 0, 1.5), (-1.2, 0, -1.5), (-1.2, 1, -1.5), (-1.2, 1, 1.5)])
+    _mesh(stage, "Floor", floor, quad, (0.8, 0.8, 0.8))
+    _mesh(stage, "Wall", wall, quad, (WALL_ALBEDO,) * 3)
+    _mesh(stage, "Screen", screen, quad, (0.0, 0.0, 0.0))
+    sun = UsdLux.DistantLight.Define(stage, "/World/Sun")
+    sun.CreateAngleAttr(0.0)
+    sun.CreateIntensityAttr(3.0)
+    _look(sun, (1, 2, 0), (0, 0, 0), (0, 1, 0))
+    camera = UsdGeom.Camera.Define(stage, "/World/Camera")
+    camera.CreateFocalLengthAttr(60.0)
+    camera.CreateClippingRangeAttr(Gf.Vec2f(0.01, 100))
+    _look(camera, (0.2, 3, 0), (0.2, 0, 0), (0, 0, -1))
+    stage.GetRootLayer().Save()
+    return path
+
+
+def _look(prim: UsdGeom.Xformable, eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...]) -> None:
+    matrix = Gf.Matrix4d().SetLookAt(Gf.Vec3d(*eye), Gf.Vec3d(*target), Gf.Vec3d(*up)).GetInverse()
+    UsdGeom.Xformable(prim).MakeMatrixXform().Set(matrix)

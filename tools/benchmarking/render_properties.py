@@ -1,0 +1,222 @@
+"""Suite `properties`: what must hold of edits in the final gather, measured.
+
+- A hard edge of a mask: error of the change that an edit makes in the pixels about the edge, against brute force.
+- An offset from casters half of which are hidden: all of it must arrive.
+- The same bits from 1, 2 and 8 threads, with the edits of the stage.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.edits.model import Edit, EditStack, Region, Selection, Shape
+from icheat_usd.final_gather import GatherSettings
+from icheat_usd.samples import view_samples
+from icheat_usd.samples.develop import average
+from icheat_usd.scene import F32, F64, Bool, SceneSnapshot
+from icheat_usd.stage import open_stage, take_snapshot
+from tools.benchmarking.generated import WALL_ALBEDO, WALL_AREA, WALL_COSINE, write_screened
+from tools.benchmarking.parts import Effort
+from tools.benchmarking.render_edits import shares_of
+from tools.benchmarking.render_efforts import RenderEffort, usual
+from tools.benchmarking.render_frame import Frame
+from tools.benchmarking.render_images import write_sheet
+from tools.benchmarking.runner import ROOT
+from tools.benchmarking.statistics import relative_error
+from tools.peers.mitsuba_peer import as_diffuse
+
+_THREADS = (1, 2, 8)
+_SIZE, _QUICK_SIZE = (160, 120), (24, 18)
+_BAND = 8  #: pixels to either side of the edge
+_GAIN = 3.0  #: inside the mask
+_REFERENCE = GatherSettings(method="brute", samples_per_pixel=4, gather_rays=192)
+_QUICK_REFERENCE = replace(_REFERENCE, gather_rays=8)
+
+#: Of the offset, which arrives from a wall whose lower half is hidden.
+_OFFSET = 0.70
+
+
+def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
+    """Edge and bits on the first stage; the offset has one of its own."""
+    return [{"stage": stages[0], "property": name} for name in ("edge", "offset", "bits")]
+
+
+def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
+    """Figures of one property."""
+    if case["property"] == "edge":
+        return _edge(case["stage"], quick, folder)
+    if case["property"] == "offset":
+        return _offset(usual(quick))
+    return _bits(case["stage"], _QUICK_SIZE if quick else (effort.width // 2, effort.height // 2), quick)
+
+
+def _edge(stage: str, quick: bool, folder: Path) -> dict[str, Any]:
+    """A hard-edged region on the surface that is seen most, for light from all and from the first caster."""
+    width, height = _QUICK_SIZE if quick else _SIZE
+    snapshot = as_diffuse(take_snapshot(open_stage(stage), width=width, height=height))
+    frame = Frame(snapshot, usual(quick))
+    shares = shares_of(frame)
+    receiver = max(shares.seen, key=lambda path: shares.seen[path])
+    caster = max((p for p in shares.hit if p != receiver), key=lambda path: shares.hit[path])
+    region = _half(frame, receiver)
+    band = _band(frame, receiver, region)
+    found: dict[str, Any] = {"receiver": receiver, "caster": caster, "pixels": int(band.sum())}
+    for name, casters in (("from all", frozenset(shares.hit)), ("from one caster", frozenset([caster]))):
+        edit = Edit("/edge", "scale", {"gain": _GAIN}, Selection(frozenset([receiver]), (region,)), Selection(casters))
+        stack = EditStack("/Edge", (edit,))
+        image, _ = frame.render(frame.field(stack))
+        halves = [_reference(snapshot, stack, seed, quick) for seed in (1, 2)]
+        edited = relative_error(image.indirect_edited[band], *(half.indirect_edited[band] for half in halves))
+        unedited = relative_error(image.indirect[band], *(half.indirect[band] for half in halves))
+        mean = (halves[0].indirect_edited + halves[1].indirect_edited) / 2
+        found[name] = {
+            "edited": edited.as_dict(),
+            "unedited": unedited.as_dict(),
+            "image": write_sheet(folder / "properties" / f"edge {name}.png", image.indirect_edited, mean),
+        }
+    return found
+
+
+def _reference(snapshot: SceneSnapshot, stack: EditStack, seed: int, quick: bool) -> Any:
+    effort = usual(quick)
+    settings = replace(_QUICK_REFERENCE if quick else _REFERENCE, seed=seed)
+    frame = Frame(snapshot, RenderEffort(settings, effort.quality))
+    return frame.render(frame.field(stack))[0]
+
+
+def _half(frame: Frame, path: str) -> Region:
+    """A box, one side of which cuts what is seen of a surface in two, askew."""
+    points = frame.view.points
+    rows = [i for i, surface in enumerate(frame.snapshot.surfaces) if surface.path == path]
+    on = np.isin(frame.snapshot.geometry.instance_surface[points.instance], rows)
+    places = points.position[on].astype(float) + frame.snapshot.centre
+    middle = np.median(places, axis=0)
+    _, _, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
+    turn = np.radians(25)
+    across = np.cos(turn) * axes[0] + np.sin(turn) * axes[1]
+    along = np.cos(turn) * axes[1] - np.sin(turn) * axes[0]
+    half = 10 * frame.snapshot.radius
+    matrix = np.stack([across, along, np.cross(across, along)]) / half
+    offset = -matrix @ (middle - half * across)
+    rows_of_matrix = np.concatenate([matrix, offset[:, None]], axis=1)
+    return Region(Shape.BOX, tuple(float(x) for x in rows_of_matrix.ravel()))
+
+
+def _band(frame: Frame, path: str, region: Region) -> Bool:
+    """Pixels that show nothing but the surface, near where the region ends."""
+    camera = frame.snapshot.camera
+    view = view_samples(frame.snapshot, frame.tracer, samples_per_pixel=16, max_splits=0)
+    rows = [i for i, surface in enumerate(frame.snapshot.surfaces) if surface.path == path]
+    on = np.isin(frame.snapshot.geometry.instance_surface[view.points.instance], rows)
+    matrix = np.array(region.to_shape).reshape(3, 4)
+    local = (view.points.position.astype(float) + frame.snapshot.centre) @ matrix[:, :3].T + matrix[:, 3]
+    inside = (np.abs(local) <= 1).all(axis=1)
+    shape = (camera.height, camera.width)
+    values = np.stack([inside, on], axis=1).astype(np.float32)
+    share, surface = (column.reshape(shape) for column in average(view, values).T)
+    near = _grown((share > 0) & (surface == 1), _BAND) & _grown((share < 1) & (surface == 1), _BAND)
+    return np.asarray(near & (surface == 1))
+
+
+def _grown(mask: Bool, by: int) -> Bool:
+    """Pixels up to `by` pixels away along the axes."""
+    for _ in range(by):
+        more = mask.copy()
+        more[1:] |= mask[:-1]
+        more[:-1] |= mask[1:]
+        more[:, 1:] |= mask[:, :-1]
+        more[:, :-1] |= mask[:, 1:]
+        mask = more
+    return mask
+
+
+def _offset(effort: RenderEffort) -> dict[str, Any]:
+    """What arrives of an offset that is 0.70 in all."""
+    with tempfile.TemporaryDirectory() as scratch:
+        stage = write_screened(Path(scratch) / "screened.usda")
+        snapshot = as_diffuse(take_snapshot(open_stage(stage), width=16, height=12))
+    sent = snapshot.lights.radiance[0].astype(float) * WALL_ALBEDO / np.pi * WALL_COSINE
+    density = tuple(float(x) for x in _OFFSET / (sent * WALL_AREA))
+    floor, wall = (Selection(frozenset([f"/World/{name}"])) for name in ("Floor", "Wall"))
+    paint = Edit("/paint", "paint", {"color": density, "relative": False}, floor, wall)
+    # What the sun sends and the wall reflects, and no light of the floor on the wall.
+    once = RenderEffort(replace(effort.settings, n_bounces=1), replace(effort.quality, n_bounces=1))
+    frame = Frame(snapshot, once)
+    image, _ = frame.render(frame.field(EditStack("/Paint", (paint,))))
+    added = image.indirect_edited - image.indirect
+    return {"expected": _OFFSET, "mean": float(added.mean()), "largest_error": float(np.abs(added - _OFFSET).max())}
+
+
+def _bits(stage: str, size: tuple[int, int], quick: bool) -> dict[str, Any]:
+    """Digests of all layers by number of threads, each in a process of its own."""
+    shot = Path(stage).with_name("shot.usda")
+    task = {"stage": str(shot if shot.exists() else stage), "width": size[0], "height": size[1], "quick": quick}
+    found = {}
+    for threads in _THREADS[: 2 if quick else None]:
+        environment = os.environ | {"NUMBA_NUM_THREADS": str(threads), "PYTHONPATH": str(ROOT)}
+        worker = [sys.executable, "-m", "tools.benchmarking.render_properties", json.dumps(task)]
+        done = subprocess.run(worker, env=environment, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        found[str(threads)] = done.stdout.split()[-1]
+    return {"stage": task["stage"], "digests": found, "same_bits": len(set(found.values())) == 1}
+
+
+def _digest(task: dict[str, Any]) -> str:
+    """Of the layers of one frame with the edits of the stage."""
+    from icheat_usd.session import Session
+
+    effort = usual(task["quick"])
+    size = {"width": task["width"], "height": task["height"]}
+    film = Session.open(task["stage"], quality=effort.quality, **size).render(effort.settings)
+    digest = hashlib.sha256()
+    for name in sorted(film.layers):
+        layer: F32 | F64 = film.layers[name]
+        digest.update(name.encode() + np.ascontiguousarray(layer).tobytes())
+    return digest.hexdigest()
+
+
+def markdown(results: list[dict[str, Any]]) -> list[str]:
+    """Tables for README."""
+    found = {one["case"]["property"]: (one["case"]["name"], one["result"]) for one in results if "result" in one}
+    lines: list[str] = []
+    if "edge" in found:
+        stage, edge = found["edge"]
+        lines += [
+            f"Relative RMS errors (± standard error) within {_BAND} pixels of a hard edge of a mask, {stage},"
+            f" {edge['pixels']} pixels:",
+            "",
+            "| light scaled | edited | unedited | 99 % of the pixels, edited |",
+            "| --- | ---: | ---: | ---: |",
+        ]
+        for name in ("from all", "from one caster"):
+            edited, unedited = edge[name]["edited"], edge[name]["unedited"]
+            lines.append(
+                f"| {name} | {100 * edited['rms']:.2f} ± {100 * edited['standard_error']:.2f} % |"
+                f" {100 * unedited['rms']:.2f} ± {100 * unedited['standard_error']:.2f} % |"
+                f" {100 * edited['percentile_99']:.2f} % (with the reference's noise) |"
+            )
+        lines.append("")
+    if "offset" in found:
+        offset = found["offset"][1]
+        lines.append(
+            f"Offset of {offset['expected']:.2f} from a wall half of which is hidden: {offset['mean']:.5f} arrives,"
+            f" largest error of a pixel {offset['largest_error']:.1e}."
+        )
+    if "bits" in found:
+        bits = found["bits"][1]
+        same = "the same bits" if bits["same_bits"] else "DIFFERENT BITS"
+        lines.append(f"{', '.join(bits['digests'])} threads, {Path(bits['stage']).parent.name} with its edits: {same}.")
+    return lines
+
+
+if __name__ == "__main__":
+    print(_digest(json.loads(sys.argv[1])))
