@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from icheat_usd.image.png import encode_png
-from icheat_usd.scene import F64, U8
+from icheat_usd.scene import F32, F64, U8
 
 #: Relative error that is shown as full red (too bright) or full blue (too dark).
 _FULL = 0.25
@@ -27,6 +27,11 @@ def write_png(path: Path, pixels: U8) -> str:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_png(np.ascontiguousarray(pixels), srgb=True, text={}))
     return path.name
+
+
+def as_bytes(image: F32) -> U8:
+    """A scene-linear image as it is shown, with light of 1 as white."""
+    return np.asarray(255 * np.clip(image, 0, 1) ** (1 / 2.2) + 0.5, np.uint8)
 
 
 def _as_light(image: F64) -> U8:

@@ -1,7 +1,8 @@
 """A stage as every renderer of the suite `rivals` can have it: the same surfaces, lights and camera for all of them.
 
 Surfaces are diffuse. Rectangles, disks and balls that shine block rays in other renderers but not here, so each gets
-a black cover just behind it. Lights that others lack are left out, for all of them, and named.
+a black cover just behind it. Lights are neither linked nor shaped.
+Those that others lack are left out, for all of them, and named.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class RivalScene(NamedTuple):
 
 def rival_scene(stage: str | Path, width: int, height: int) -> RivalScene:
     """The diffuse version of a stage; one without a light of finite size gets one at the camera."""
-    snapshot = as_diffuse(take_snapshot(open_stage(stage), width=width, height=height))
+    snapshot = take_snapshot(open_stage(stage), width=width, height=height)
+    snapshot = replace(as_diffuse(snapshot), light_controls=())
     kinds = [LightKind(int(kind)) for kind in snapshot.lights.kind]
     keep = [i for i, kind in enumerate(kinds) if kind in EXPORTED]
     left_out = tuple(snapshot.light_paths[i] for i in range(len(kinds)) if i not in keep)

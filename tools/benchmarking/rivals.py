@@ -213,10 +213,7 @@ def _luxcore(stand: _Stand, samples: tuple[int, ...]) -> dict[str, Any]:
     direct = sum(whole - indirect for whole, indirect in zip(stand.known.whole, stand.known.indirect, strict=True)) / 2
 
     def renders() -> Iterator[_Render]:
-        for n in samples:
-            start = time.perf_counter()
-            whole = scene.render(n, depth=DEPTH)
-            seconds = time.perf_counter() - start
+        for n, (whole, seconds) in zip(samples, scene.render(samples, DEPTH), strict=True):
             whole[~stand.seen] = direct[~stand.seen]  # sources
             # The reference's direct light is subtracted; what LuxCore's own is off counts as error.
             yield _Render(f"{n} spp", seconds, whole - direct, whole)

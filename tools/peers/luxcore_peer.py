@@ -5,7 +5,13 @@ Diffuse surfaces without textures, rectangles that shine and emissive meshes: wh
 
 from __future__ import annotations
 
-import time
+import importlib.util
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +27,7 @@ _SHEET = 5e-5
 
 
 class LuxCoreScene:
-    """A scene in LuxCore.
+    """A scene for LuxCore.
 
     Raises
     ------
@@ -32,32 +38,54 @@ class LuxCoreScene:
     """
 
     def __init__(self, snapshot: SceneSnapshot) -> None:
-        try:
-            import pyluxcore  # NumPy has to be loaded first, which is done above
-        except ImportError as error:
-            raise ImportError("pyluxcore is not installed") from error
-        pyluxcore.Init()
-        self._lux, self._snapshot = pyluxcore, snapshot
-        self._scene = pyluxcore.Scene()
-        self._set(_camera(snapshot))
-        self._set({"scene.textures.own.type": "hitpointcolor"})
-        self._set({"scene.materials.painted.type": "matte", "scene.materials.painted.kd": "own"})
+        if importlib.util.find_spec("pyluxcore") is None:
+            raise ImportError("pyluxcore is not installed")
+        self._snapshot = snapshot
+        self._meshes: list[dict[str, Any]] = []
+        self._scene = _camera(snapshot) | {
+            "scene.textures.own.type": "hitpointcolor",
+            "scene.materials.painted.type": "matte",
+            "scene.materials.painted.kd": "own",
+        }
         for material, part in world_parts(snapshot).items():
             self._add_part(material, part)
         refuse_controls(snapshot)
         for light in range(len(snapshot.lights.kind)):
             self._add_light(light)
 
-    def render(self, samples: int, depth: int, seed: int = 1) -> F64:
-        """All light (height, width, 3) of paths of up to `depth` segments; the cache is made anew each time."""
-        width, height = self._snapshot.camera.width, self._snapshot.camera.height
-        settings = {
+    def render(self, samples: Sequence[int], depth: int) -> list[tuple[F64, float]]:
+        """All light (height, width, 3) of paths of up to `depth` segments with so many samples, and seconds.
+
+        The cache is made anew for each, and its time counts.
+
+        Raises
+        ------
+        RuntimeError
+            LuxCore failed.
+        """
+        told = {"scene": self._scene, "meshes": self._meshes, "renders": [self._settings(n, depth) for n in samples]}
+        with tempfile.TemporaryDirectory() as scratch:
+            description, images = Path(scratch) / "told.pickle", Path(scratch) / "images.npz"
+            description.write_bytes(pickle.dumps(told))
+            child = Path(__file__).with_name("luxcore_child.py")
+            command = [sys.executable, str(child), str(description), str(images)]
+            done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+            if not images.exists():
+                raise RuntimeError(f"LuxCore ended with {done.returncode}: {done.stdout[-500:]}")
+            with np.load(images) as found:
+                return [
+                    (found[f"image{i}"].astype(np.float64), float(seconds))
+                    for i, seconds in enumerate(found["seconds"])
+                ]
+
+    def _settings(self, samples: int, depth: int) -> dict[str, Any]:
+        return {
             "renderengine.type": "PATHCPU",
-            "renderengine.seed": seed,
+            "renderengine.seed": 1,
             "sampler.type": "SOBOL",
             "sampler.sobol.adaptive.strength": 0.0,
-            "film.width": width,
-            "film.height": height,
+            "film.width": self._snapshot.camera.width,
+            "film.height": self._snapshot.camera.height,
             "film.filter.type": "NONE",
             "film.outputs.0.type": "RGB",
             "film.outputs.0.filename": "none.exr",
@@ -69,20 +97,9 @@ class LuxCoreScene:
             "path.photongi.photon.maxdepth": depth - 1,
             "path.photongi.indirect.enabled": True,
             "path.photongi.indirect.maxsize": _MOST_RECORDS,
-            "path.photongi.indirect.lookup.radius": _LOOKUP_RADIUS * self._snapshot.radius,
+            "path.photongi.indirect.lookup.radius": float(_LOOKUP_RADIUS * self._snapshot.radius),
             "path.photongi.caustic.enabled": False,
         }
-        session = self._lux.RenderSession(self._lux.RenderConfig(self._properties(settings), self._scene))
-        session.Start()
-        while not session.HasDone():  # which is found out by looking at the statistics
-            time.sleep(0.005)
-            session.UpdateStats()
-        image = np.zeros(width * height * 3, np.float32)
-        session.GetFilm().GetOutputFloat(self._lux.FilmOutputType.RGB, image, 0)
-        session.Stop()
-        # From the bottom up, and one row too low: found by comparing with other renderers.
-        rows = image.reshape(height, width, 3)[::-1]
-        return np.concatenate([rows[1:], rows[-1:]]).astype(np.float64)
 
     def _add_part(self, material: int, part: Part) -> None:
         if material < 0:
@@ -115,31 +132,16 @@ class LuxCoreScene:
 
     def _add_emitter(self, name: str, reflectance: Any, radiance: Any) -> None:
         prefix = f"scene.materials.{name}"
-        self._set(
-            {
-                f"{prefix}.type": "matte",
-                f"{prefix}.kd": [float(x) for x in reflectance],
-                f"{prefix}.emission": [float(x) for x in radiance],
-                f"{prefix}.emission.gain": [1.0, 1.0, 1.0],
-                f"{prefix}.emission.power": 0.0,
-            }
-        )
+        self._scene |= {
+            f"{prefix}.type": "matte",
+            f"{prefix}.kd": [float(x) for x in reflectance],
+            f"{prefix}.emission": [float(x) for x in radiance],
+            f"{prefix}.emission.gain": [1.0, 1.0, 1.0],
+            f"{prefix}.emission.power": 0.0,
+        }
 
-    def _add_mesh(self, name: str, corners: Any, color: Any, material: str) -> None:
-        points = [tuple(map(float, point)) for point in np.asarray(corners).reshape(-1, 3)]
-        triangles = [(3 * i, 3 * i + 1, 3 * i + 2) for i in range(len(points) // 3)]
-        colors = None if color is None else [tuple(map(float, x)) for x in color]
-        self._scene.DefineMesh(name, points, triangles, None, None, colors, None)
-        self._set({f"scene.objects.{name}.shape": name, f"scene.objects.{name}.material": material})
-
-    def _set(self, values: dict[str, Any]) -> None:
-        self._scene.Parse(self._properties(values))
-
-    def _properties(self, values: dict[str, Any]) -> Any:
-        properties = self._lux.Properties()
-        for name, value in values.items():
-            properties.Set(self._lux.Property(name, value))
-        return properties
+    def _add_mesh(self, name: str, corners: Any, colors: Any, material: str) -> None:
+        self._meshes.append({"name": name, "corners": np.asarray(corners), "colors": colors, "material": material})
 
 
 def _camera(snapshot: SceneSnapshot) -> dict[str, Any]:

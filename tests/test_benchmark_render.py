@@ -1,0 +1,119 @@
+"""The benchmark of the final gather runs at tiny sizes, and its sums are right."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tools.benchmarking import rival_summary
+from tools.benchmarking.render_sequence import flicker
+from tools.benchmarking.rival_errors import squared_errors, trimmed_rel_mse
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "tools/benchmark", *arguments], cwd=REPOSITORY, capture_output=True, text=True
+    )
+
+
+@pytest.mark.slow
+def test_suites_of_the_final_gather_report(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba")
+    folders = ("--output", str(tmp_path), "--references", str(tmp_path / "references"))
+    done = run("render", "--quick", "--only", "rivals,edits,properties,scale,sequence", *folders)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    report = json.loads((tmp_path / "report.json").read_text())
+    results = {name: [one["result"] for one in suite] for name, suite in report["suites"].items()}
+
+    assert results["rivals"][0]["reference"]["samples_per_half"] > 0
+    curves = rival_summary.curves_of(report["suites"]["rivals"])["cornell_box"]
+    assert {"ours", "mitsuba scalar"} <= curves.keys()
+    absent = {name for one in results["rivals"] for name in one.get("absent", {})}
+    rivals = {"mitsuba llvm", "mitsuba scalar", "LuxCore PhotonGI"}
+    assert curves.keys() | absent >= rivals and not curves.keys() & absent
+    cached = next(point for point in curves["ours"] if point["label"] == "cached")
+    # Both renderers render the same light: a scene that one of them got wrong is off by far more.
+    assert cached["mean_ratio"] == pytest.approx(1, abs=0.1)
+    assert curves["mitsuba scalar"][-1]["rel_mse"] < curves["mitsuba scalar"][0]["rel_mse"] / 2
+    for points in curves.values():
+        assert all(point["seconds"] > 0 and np.isfinite(point["rel_mse"]) for point in points)
+        assert any((tmp_path / "images" / "rivals" / point.get("image", "-")).exists() for point in points)
+
+    times = results["edits"][0]["times"]
+    assert times.keys() == {"none", "1", "3", "3 apart"}
+    assert all(share["least"] >= 0.3 for n in ("1", "3") for share in times[n]["shares"].values())
+
+    properties = {one["case"]["property"]: one["result"] for one in report["suites"]["properties"]}
+    assert properties["bits"]["same_bits"]
+    assert properties["offset"]["mean"] == pytest.approx(0.70, rel=1e-4)
+    assert properties["edge"]["pixels"] > 10
+    assert {point["what"] for point in results["scale"]} == {"triangles", "lights", "pixels"}
+    assert all(one["touched_share"] > 0 for one in results["sequence"])
+    text = (tmp_path / "report.md").read_text()
+    assert all(f"### {name}" in text for name in results)
+    assert "failed" not in text
+
+
+def test_errors_do_not_hold_the_noise_of_the_reference() -> None:
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(np.linspace(0, 3, 160), np.linspace(0, 2, 120))
+    truth = (1.2 + np.sin(2 * x) * np.cos(3 * y))[..., None] * np.array([1.0, 0.7, 0.4])
+    halves = [truth * (1 + 0.2 * rng.normal(size=truth.shape)) for _ in range(2)]
+    image = truth * (1 + 0.1 * rng.choice([-1, 1], truth.shape))
+    noise_free = squared_errors(image, truth, truth).mean()
+    assert squared_errors(image, *halves).mean() == pytest.approx(noise_free, rel=0.1)
+    assert squared_errors(image, halves[0], halves[0]).mean() > 3 * noise_free
+    # An exact image has no error, trimmed or not; a trim of the largest alone would make it better than exact.
+    exact = squared_errors(truth, *halves).ravel()
+    assert abs(exact.mean()) < 0.05 * noise_free
+    assert abs(trimmed_rel_mse(exact)) < 0.05 * noise_free
+    leaks = image.copy()
+    leaks[:2, :5] *= 30
+    squares = squared_errors(leaks, truth, truth).ravel()
+    assert squares.mean() > 10 * noise_free
+    assert trimmed_rel_mse(squares) == pytest.approx(noise_free, rel=0.05)
+
+
+def test_curves_are_compared_at_equal_time() -> None:
+    def point(label: str, seconds: float, error: float) -> dict[str, object]:
+        return {"label": label, "seconds": seconds, "rel_mse": error, "rel_mse_trimmed": error / 2}
+
+    raw = [point(f"{n}", 0.1 * n, 1.0 / n) for n in (1, 4, 16, 64, 256, 1024)]
+    denoised = [point(f"{n}", 0.1 * n, 0.1 / n) for n in (1, 4, 16, 64, 256, 1024)]
+    ours = [point("low", 1.0, 0.005), point("worse", 2.0, 0.006), point("high", 16.0, 0.001)]
+    found = rival_summary.comparison({"mitsuba llvm": raw, "mitsuba llvm + OIDN": denoised, "ours": ours})
+    assert found["efficiency"]["rel_mse"]["low"] == pytest.approx(0.1 / 0.005)
+    over = found["over_denoised"]["rel_mse"]
+    assert over.keys() == {"1", "4", "16"}  # ours does not reach 64 s
+    assert over["1"] == pytest.approx(0.005 / 0.01)
+    # Between 1 s and 16 s on a straight line in the logarithms, past the point that is worse than a quicker one.
+    assert over["4"] == pytest.approx(np.sqrt(0.005 * 0.001) / 0.0025)
+
+
+def test_flicker_is_nothing_where_light_changes_evenly() -> None:
+    frame = np.linspace(0, 1, 6)[:, None, None, None]
+    even = np.exp(frame) * np.ones((6, 4, 4, 3))
+    assert flicker(even) == pytest.approx(0, abs=1e-12)
+    jumping = even * np.where(np.arange(6) % 2, 1.1, 1.0)[:, None, None, None]
+    assert flicker(jumping) == pytest.approx(2 * np.log(1.1), rel=1e-6)
+
+
+def test_help_needs_no_package_and_a_missing_one_is_named(tmp_path: Path) -> None:
+    (tmp_path / "numpy.py").write_text("raise ModuleNotFoundError(\"No module named 'numpy'\", name='numpy')\n")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, str(REPOSITORY / "tools" / "benchmark"), "render"]
+    done = subprocess.run([*command, "--help"], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "--references" in done.stdout
+    done = subprocess.run(
+        [*command, "--quick", "--output", str(tmp_path)], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "numpy is not installed" in done.stderr and "make lint" in done.stderr

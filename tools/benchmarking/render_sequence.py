@@ -1,0 +1,114 @@
+"""Suite `sequence`: frames of an animated stage with keyed edits, and whether they flicker.
+
+Flicker is what a pixel does beside moving evenly: the root mean square of its second difference over frames, of the
+logarithm of the light, with edits and without, from the same renders. What moves in the picture is in both.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.image.contact import contact_sheet
+from icheat_usd.scene import F32, F64
+from icheat_usd.session import Session
+from icheat_usd.stage import open_stage
+from tools.benchmarking.parts import Effort
+from tools.benchmarking.render_efforts import usual
+from tools.benchmarking.render_images import as_bytes, write_png
+from tools.benchmarking.runner import ROOT
+
+STAGE = "sample_stages/animated_room/sequence.usda"
+_FRAMES, _QUICK_FRAMES = 48, 4
+_SIZE, _QUICK_SIZE = (160, 120), (16, 12)
+
+
+def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
+    """The animated sample stage, whatever stages are named."""
+    return [{"stage": str(ROOT / STAGE), "seeds": seeds} for seeds in ("one seed", "a seed a frame")]
+
+
+def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
+    """Second differences of the indirect light with edits and without, and a contact sheet of all frames."""
+    width, height = _QUICK_SIZE if quick else _SIZE
+    n = _QUICK_FRAMES if quick else _FRAMES
+    chosen = usual(quick)
+    stage = open_stage(case["stage"])
+    frames: list[dict[str, F32]] = []
+    start = time.perf_counter()
+    for frame in range(1, n + 1):
+        seed = frame if case["seeds"] == "a seed a frame" else 0
+        quality, settings = replace(chosen.quality, seed=seed), replace(chosen.settings, seed=seed)
+        session = Session.open(stage, frame=float(frame), width=width, height=height, quality=quality)
+        film = session.render(settings)
+        frames.append({name: film.layers[name] for name in ("indirect", "indirect_edited", "beauty")})
+    seconds = time.perf_counter() - start
+    edited, unedited = (np.stack([one[name] for one in frames]) for name in ("indirect_edited", "indirect"))
+    name = case["seeds"].replace(" ", "_")
+    shown = [one["beauty"] for one in frames]
+    found: dict[str, Any] = {
+        "frames": n,
+        "width": width,
+        "height": height,
+        "seconds_a_frame": seconds / n,
+        "flicker_edited": flicker(edited),
+        "flicker_unedited": flicker(unedited),
+        "touched_share": float((edited != unedited).any(axis=(0, 3)).mean()),
+        "sheet": write_png(folder / "sequence" / f"sheet_{name}.png", as_bytes(contact_sheet(shown))),
+    }
+    touched = (edited != unedited).any(axis=(0, 3))
+    if touched.any():
+        found["flicker_edited_where_touched"] = flicker(edited[:, touched])
+        found["flicker_unedited_where_touched"] = flicker(unedited[:, touched])
+    found["video"] = _video(shown, folder / "sequence" / f"{name}.mp4")
+    return found
+
+
+def flicker(images: F32 | F64) -> float:
+    """Root mean square second difference over frames of the logarithm of the light.
+
+    Parameters
+    ----------
+    images : (n_frames, ..., 3) scene-linear
+        Light below a hundredth of the mean counts as that.
+    """
+    light = np.asarray(images, np.float64).mean(axis=-1)
+    logarithm = np.log(np.maximum(light, 0.01 * light.mean() + 1e-12))
+    return float(np.sqrt((np.diff(logarithm, 2, axis=0) ** 2).mean()))
+
+
+def _video(images: list[F32], path: Path) -> str | None:
+    """The frames as a video, where ffmpeg is installed."""
+    if shutil.which("ffmpeg") is None:
+        return None
+    pixels = np.stack([as_bytes(image) for image in images])
+    height, width = pixels.shape[1:3]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    command += ["-r", "24", "-i", "-", "-pix_fmt", "yuv420p", str(path)]
+    done = subprocess.run(command, input=pixels.tobytes(), check=False)
+    return path.name if done.returncode == 0 else None
+
+
+def markdown(results: list[dict[str, Any]]) -> list[str]:
+    """Table for README."""
+    lines = [
+        "| frames | seeds | time a frame | flicker unedited | edited | where edits act: unedited | edited |",
+        "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for one in (one for one in results if "result" in one):
+        found = one["result"]
+        touched = [found.get(f"flicker_{name}_where_touched") for name in ("unedited", "edited")]
+        cells = ["" if value is None else f"{value:.4f}" for value in touched]
+        lines.append(
+            f"| {found['frames']} of {found['width']}x{found['height']} | {one['case']['seeds']} |"
+            f" {found['seconds_a_frame']:.2f} s | {found['flicker_unedited']:.4f} | {found['flicker_edited']:.4f} |"
+            f" {' | '.join(cells)} |"
+        )
+    return lines
