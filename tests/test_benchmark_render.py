@@ -28,7 +28,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_suites_of_the_final_gather_report(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba")
     folders = ("--output", str(tmp_path), "--references", str(tmp_path / "references"))
-    done = run("render", "--quick", "--only", "rivals,edits,properties,scale,sequence", *folders)
+    done = run("render", "--quick", "--only", "rivals,edits,properties,scale,sequence,killed", *folders)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
     report = json.loads((tmp_path / "report.json").read_text())
     results = {name: [one["result"] for one in suite] for name, suite in report["suites"].items()}
@@ -57,6 +57,8 @@ def test_suites_of_the_final_gather_report(tmp_path: Path) -> None:
     assert properties["edge"]["pixels"] > 10
     assert {point["what"] for point in results["scale"]} == {"triangles", "lights", "pixels"}
     assert all(one["touched_share"] > 0 for one in results["sequence"])
+    killed = results["killed"][0]
+    assert killed["same_pixels"] == killed["frames"] == 2 and killed["half_written"] == 0
     text = (tmp_path / "report.md").read_text()
     assert all(f"### {name}" in text for name in results)
     assert "failed" not in text

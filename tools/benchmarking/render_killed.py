@@ -20,9 +20,9 @@ from tools.benchmarking.parts import Effort
 from tools.benchmarking.render_sequence import STAGE
 from tools.benchmarking.runner import ROOT
 
-_FRAMES, _QUICK_FRAMES = 12, 1
+_FRAMES, _QUICK_FRAMES = 12, 2
 _KILLS, _QUICK_KILLS = 10, 1
-_SIZE, _QUICK_SIZE = (96, 72), (12, 9)
+_SIZE, _QUICK_SIZE = (320, 240), (12, 9)
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
@@ -65,7 +65,8 @@ def _names(quick: bool) -> list[str]:
 def _run(stage: str, folder: Path, quick: bool) -> subprocess.Popen[bytes]:
     width, height = _QUICK_SIZE if quick else _SIZE
     command = [sys.executable, "-m", "icheat_usd", "render", stage, "--frames", f"1:{len(_names(quick))}"]
-    command += ["--width", str(width), "--height", str(height), "--samples", "1", "-o", str(folder / "frame.####.exr")]
+    command += ["--width", str(width), "--height", str(height), "--method", "brute", "--samples", "1"]
+    command += ["--rays", "16", "-o", str(folder / "frame.####.exr")]
     output = subprocess.DEVNULL
     return subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output, start_new_session=True)
 
