@@ -82,7 +82,7 @@ def _render(
         stack=options.stack,
         width=options.width,
         height=options.height,
-        quality=Quality(seed=options.seed),
+        quality=Quality(seed=options.seed, n_bounces=settings.n_bounces),
         progress=progress,
         product=view.product,
     )

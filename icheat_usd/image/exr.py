@@ -1,6 +1,6 @@
 """Films to and from OpenEXR.
 
-Channels: `beauty` is R, G, B; `depth` is Z; `normal` is N.X, N.Y, N.Z; any
+Channels: `beauty` is R, G, B and `alpha` A; `depth` is Z; `normal` is N.X, N.Y, N.Z; any
 other colour layer is ``<layer>.R``, ``.G``, ``.B`` and any other scalar layer
 the channel ``<layer>``. Channels have the same names in one part and in many,
 so that parts can be put together. Metadata are string attributes ``icheat:<key>``,
@@ -32,6 +32,8 @@ MATTE_PREFIX = "cryptomatte/"
 
 _HALF_MAX = 65504.0
 _LAYER_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
+#: Channels of scalar layers that have names of their own.
+_SCALARS = {"depth": "Z", "alpha": "A"}
 _RESERVED = {"R", "G", "B", "A", "X", "Y", "Z", "N"}
 
 
@@ -67,6 +69,8 @@ def write_exr(
     for name, pixels in film.layers.items():
         is_half = half if isinstance(half, bool) else name in half
         parts[name] = {channel: _stored(plane, is_half and channel != "Z") for channel, plane in _planes(name, pixels)}
+    if "beauty" in parts and "alpha" in parts:
+        parts["beauty"] |= parts.pop("alpha")  # where compositors look for it
     for matte in film.mattes:
         parts[matte.name] = {channel: _stored(plane, False) for channel, plane in matte.planes.items()}
     if not parts:
@@ -113,8 +117,8 @@ def read_exr(path: str | os.PathLike[str]) -> Film:
     -------
     Film
         Pixels of the data window as float32; values are not converted from
-        the file's chromaticities. Alpha channels are left out, but those of ID
-        mattes. Parts of the first part's size are put together; a channel
+        the file's chromaticities. Alpha channels of other programs are left out.
+        Parts of the first part's size are put together; a channel
         whose name is taken gets the part's before its own.
 
     Raises
@@ -155,9 +159,11 @@ def read_exr(path: str | os.PathLike[str]) -> Film:
         raise ImageError(f"{source}: the pixels are damaged or cut short; write or copy the image again")
     height, width = next(iter(channels.values())).shape
     mattes = tuple(_mattes(metadata, channels))
+    alpha = channels.pop("A", None) if any(key.startswith(METADATA_PREFIX) for key in metadata) else None
     own = {key.removeprefix(METADATA_PREFIX): text for key, text in metadata.items() if key.startswith(METADATA_PREFIX)}
     aspect = float(parts[0][1].get("pixelAspectRatio", 1.0))
-    return Film(width, height, _layers(channels), own, mattes, aspect)
+    layers = _layers(channels) | ({} if alpha is None else {"alpha": alpha})
+    return Film(width, height, layers, own, mattes, aspect)
 
 
 def _planes(name: str, pixels: F32) -> Iterator[tuple[str, F32]]:
@@ -167,10 +173,10 @@ def _planes(name: str, pixels: F32) -> Iterator[tuple[str, F32]]:
             f"{', '.join(sorted(_RESERVED))}"
         )
     if pixels.ndim == 2:
-        yield ("Z" if name == "depth" else name), pixels
+        yield _SCALARS.get(name, name), pixels
         return
-    if name == "depth":
-        raise ImageError("layer 'depth' has three components; depth is one number per pixel")
+    if name in _SCALARS:
+        raise ImageError(f"layer '{name}' has three components; {name} is one number per pixel")
     prefix, components = {"beauty": ("", "RGB"), "normal": ("N.", "XYZ")}.get(name, (name + ".", "RGB"))
     for index, component in enumerate(components):
         yield prefix + component, pixels[..., index]

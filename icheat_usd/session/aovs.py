@@ -80,7 +80,7 @@ def needed(layers: Iterable[Layer], scene: Scene) -> Extras:
     return Extras(
         contributions=any(source.startswith("edit.") for source in sources),
         light_groups=lights,
-        objects="crypto_object" in sources,
+        objects=not sources.isdisjoint({"alpha", "crypto_object"}),
         edits="crypto_edit" in sources,
     )
 
@@ -127,6 +127,10 @@ def _values(result: FinalGather, source: str, scene: Scene) -> F64:
         return result.indirect_edited - result.indirect
     if source == "edit_ratio":
         return edit_ratio(direct + result.indirect_edited, direct + result.indirect)
+    if source == "alpha":
+        covered = result.coverage["object"]
+        height, width, _ = direct.shape
+        return np.bincount(covered.pixel, covered.share, height * width).astype(np.float64)
     family, _, name = source.partition(".")
     if family == "light":
         return result.light_groups[name]

@@ -128,7 +128,7 @@ def code_digest() -> str:
     """Digest of everything but data that decides what is computed; about 10 ms, once."""
     root = Path(icheat_usd.__file__).parent
     found = hashlib.sha256(compiler_facts().encode())
-    found.update("\n".join(f"{name} {_version(name)}" for name in _LIBRARIES).encode())
+    found.update("\n".join(f"{name} {library_version(name)}" for name in _LIBRARIES).encode())
     for path in code_files(root):
         source = path.read_bytes()
         found.update(f"{path.relative_to(root).as_posix()} {len(source)}\n".encode() + source)
@@ -140,7 +140,8 @@ def code_files(root: Path) -> tuple[Path, ...]:
     return tuple(sorted(path for path in root.rglob("*.py") if path.relative_to(root).parts[0] not in _ABOVE))
 
 
-def _version(package: str) -> str:
+def library_version(package: str) -> str:
+    """Of an installed package; "none" if it is not there."""
     try:
         return version(package)
     except PackageNotFoundError:

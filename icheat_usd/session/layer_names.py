@@ -24,6 +24,7 @@ LAYERS: Mapping[str, str] = MappingProxyType(
         "edit_ratio": "beauty over beauty without edits: multiply any renderer's beauty by it; 1 where nothing changes",
         "emission": "what glows in sight",
         "background": "domes in sight",
+        "alpha": "share of the pixel that surfaces cover: beauty less background is premultiplied by it",
         "albedo": "diffuse reflectance",
         "normal": "world space",
         "depth": "length of the path from the eye, metres",
@@ -47,6 +48,8 @@ ALIASES: Mapping[str, str] = MappingProxyType(
         "C": "beauty",
         "color": "beauty",
         "rgba": "beauty",
+        "A": "alpha",
+        "a": "alpha",
         "Z": "depth",
         "z": "depth",
         "N": "normal",
@@ -84,7 +87,7 @@ MATTES: Mapping[str, MatteName] = MappingProxyType(
 )
 
 #: Layers of one number a pixel.
-SCALARS = frozenset({"depth"})
+SCALARS = frozenset({"alpha", "depth"})
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,11 @@ def product_output(product: RenderProduct) -> tuple[Output, tuple[Finding, ...]]
                 f"{product.path}: two variables are called '{name}'; give {variable.path} another aov name"
             )
         layers[name] = layer_names.Layer(source, name)
-        findings += _data_type(variable, source)
+        if variable.n_channels == 4 and name == "beauty":
+            layers["alpha"] = layer_names.Layer("alpha", "alpha")
+            half |= {"alpha"} if variable.is_half else set()
+        else:
+            findings += _data_type(variable, source)
         if variable.is_half and source != "depth" and layer_names.n_channels(source):
             half.add(name)
     if not layers:

@@ -27,7 +27,7 @@ from icheat_usd.image.png import write_png
 from icheat_usd.image.replacing import remove_abandoned
 from icheat_usd.image.whole import whole_metadata
 from icheat_usd.session import aovs, layer_names
-from icheat_usd.session.content_keys import digest, snapshot_key
+from icheat_usd.session.content_keys import digest, library_version, snapshot_key
 from icheat_usd.session.films import image_metadata
 
 if TYPE_CHECKING:
@@ -160,7 +160,8 @@ def _frame_key(session: Session, settings: GatherSettings, about: dict[str, str]
         (weight, snapshot_key(moment.snapshot, moment.engine), moment.stack.digest, asdict(moment.quality), effort)
         for weight, moment, effort in _moments(session, settings)
     ]
-    return digest("final frame", moments, about)
+    denoiser_version = library_version("pyoidn") if settings.denoise else ""
+    return digest("final frame", moments, about, denoiser_version)
 
 
 def _content(output: Output) -> tuple[object, ...]:

@@ -22,7 +22,7 @@ _COLOR_SPACES = ("lin_rec709_scene", "lin_rec709", "lin_srgb")
 
 _DRIVER = "driver:parameters:"
 _SCALARS = ("half", "float", "double")
-_TRIPLES = re.compile(r"(color|vector|normal|point)3[hfd]|(half|float|double)3")
+_SEVERAL = re.compile(r"(?:(?:color|vector|normal|point)([34])[hfd])|(?:(?:half|float|double)([34]))")
 
 
 @dataclass(frozen=True)
@@ -143,11 +143,11 @@ def _read_variable(variable: UsdRender.Var, when: Usd.TimeCode, report: Reporter
         if attribute.GetName().startswith(_DRIVER) and attribute.GetName() != AOV_NAME:
             report(prim, attribute.GetName(), "is not supported and ignored.")
     kind = str(variable.GetDataTypeAttr().Get(when))
-    is_triple = _TRIPLES.fullmatch(kind) is not None
-    if not is_triple and kind not in _SCALARS:
+    several = _SEVERAL.fullmatch(kind)
+    if several is None and kind not in _SCALARS:
         report(prim, "dataType", f"'{kind}' is not supported; what the source has is written as float.")
-    n_channels = 3 if is_triple else 1 if kind in _SCALARS else 0
-    is_half = kind == "half" or kind == "half3" or (is_triple and kind.endswith("3h"))
+    n_channels = int(several[1] or several[2]) if several else 1 if kind in _SCALARS else 0
+    is_half = kind.startswith("half") or (several is not None and kind.endswith("h"))
     return RenderVariable(
         str(prim.GetPath()),
         str(authored or prim.GetName()),

@@ -189,6 +189,19 @@ def test_a_product_with_a_camera_of_its_own_has_that_cameras_edits(tmp_path: Pat
     assert (about["camera"], about["stack"]) == ("/World/Side", "/World/SideEdits")
 
 
+def test_a_colour_of_four_channels_has_alpha(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stage = stage_with(tmp_path, product("A", "a.exr", "Beauty"), listed="A")
+    stage.write_text(stage.read_text().replace("color3h", "color4h").replace("size = 4", "size = 1"))
+    capsys.readouterr()
+    assert render(stage, "--strict") == 0
+    film = read_exr(tmp_path / "a.exr")
+    assert set(film.layers) == {"beauty", "alpha"}
+    alpha, beauty = film.layer("alpha"), film.layer("beauty")
+    assert alpha.min() == 0 and alpha.max() == 1 and not beauty[alpha == 0].any()
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        assert {name: c.pixels.dtype for name, c in file.parts[0].channels.items()} == dict.fromkeys("RGBA", np.float16)
+
+
 def test_a_png_product_shows_its_first_variable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stage = stage_with(tmp_path, product("A", "a.png", "Indirect", "Beauty"), listed="A")
     capsys.readouterr()

@@ -27,6 +27,7 @@ def film() -> Film:
         "normal": values[:, ::-1, :3],
         "albedo": np.ascontiguousarray(values[..., :3]),
         "depth": values[..., 4],
+        "alpha": values[..., 3],
         "receiver_mask": values[..., 0].T.copy().T,
     }
     return Film(9, 7, layers, {"stage": "room.usda", "camera": "/World/Kamera_ä", "frame": "12.5"})
@@ -45,7 +46,7 @@ def test_every_layer_and_the_metadata_come_back_exactly(film: Film, tmp_path: Pa
 def test_other_programs_find_the_usual_channel_names_and_colour_space(film: Film, tmp_path: Path) -> None:
     write_exr(film, tmp_path / "film.exr")
     with OpenEXR.File(str(tmp_path / "film.exr"), separate_channels=True) as file:
-        expected = {"R", "G", "B", "Z", "N.X", "N.Y", "N.Z", "receiver_mask"}
+        expected = {"R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "receiver_mask"}
         expected |= {f"{layer}.{c}" for layer in ("direct", "indirect", "albedo") for c in "RGB"}
         assert set(file.channels()) == expected
         np.testing.assert_array_equal(file.channels()["indirect.G"].pixels, film.layer("indirect")[..., 1])
@@ -172,8 +173,8 @@ def test_another_reader_finds_a_part_for_each_layer(rich: Film, tmp_path: Path) 
     while image.seek_subimage(len(found), 0):
         spec = image.spec()
         found[spec.get_string_attribute("oiio:subimagename")] = spec
-    assert list(found) == [*rich.layers, "CryptoObject", "CryptoEdit"]
-    assert found["beauty"].channelnames == ("R", "G", "B") and found["depth"].channelnames == ("Z",)
+    assert list(found) == [*(name for name in rich.layers if name != "alpha"), "CryptoObject", "CryptoEdit"]
+    assert found["beauty"].channelnames == ("R", "G", "B", "A") and found["depth"].channelnames == ("Z",)
     assert found["direct"].channelnames == ("direct.R", "direct.G", "direct.B")
     assert found["CryptoEdit"].channelnames[:5] == (*(f"CryptoEdit00.{c}" for c in "RGBA"), "CryptoEdit01.R")
     assert str(found["direct"].format) == "half" and str(found["indirect"].format) == "float"
