@@ -147,10 +147,11 @@ def final_gather(
     band = SAMPLES_AT_ONCE if is_cached else max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
     n_edge = settings.edge_samples if is_cached else 0
     camera = CameraPass(snapshot, tracer, settings, n_edge, band)
+    # Errors of images that are parts of one are to cancel.
+    seed = settings.seed if settings.first_sample is None else int(hash_combine(settings.seed, settings.first_sample))
     find: FindLight = partial(_followed, gatherer)
     if is_cached and gather is not None:
-        find = _cached(gatherer, gather, camera, settings, progress).light
-    seed = settings.seed if settings.first_sample is None else int(hash_combine(settings.seed, settings.first_sample))
+        find = _cached(gatherer, gather, camera, settings, seed, progress).light
     bands: list[_Band] = []
     for number, (pixels, view) in enumerate(camera.all()):
         progress("gather", number / len(camera.bands))
@@ -172,14 +173,19 @@ def final_gather(
 
 
 def _cached(
-    gatherer: Gatherer, gather: GatherSamples, camera: CameraPass, settings: GatherSettings, progress: Progress
+    gatherer: Gatherer,
+    gather: GatherSamples,
+    camera: CameraPass,
+    settings: GatherSettings,
+    seed: int,
+    progress: Progress,
 ) -> CachedGather:
     """Place all records, by the camera samples that every pixel has."""
     assert gatherer.solution is not None
     snapshot = gatherer.snapshot
     cells = np.concatenate([gatherer.solution.total, np.zeros((1, 3), np.float32)])
-    n_theta, n_phi, seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(settings.seed, 0xCAC4E))
-    tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, seed)
+    n_theta, n_phi, own_seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(seed, 0xCAC4E))
+    tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed)
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=not gatherer.field.is_identity)
     views = [band.view for band in camera.first()]
     points = concatenate_points(*(view.points for view in views))

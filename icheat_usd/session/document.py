@@ -120,7 +120,7 @@ class Session(ShotParts):
             product=product,
         )
 
-    def at(self, frame: float | None, *, memory: Memory | None = None) -> Session:
+    def at(self, frame: float | None, *, memory: Memory | None = None, quality: Quality | None = None) -> Session:
         """The same stage and choices at another frame; `memory` is for a session that has none."""
         return Session(
             self.stage,
@@ -129,7 +129,7 @@ class Session(ShotParts):
             stack=self._stack_path,
             width=self._size[0],
             height=self._size[1],
-            quality=self.quality,
+            quality=self.quality if quality is None else quality,
             tracer=self._engine,
             progress=self.progress,
             disk=self._disk,

@@ -164,6 +164,17 @@ def test_without_motion_there_is_one_moment_the_session_itself() -> None:
     assert only.first_sample is None
 
 
+def test_what_rests_while_the_shutter_is_open_is_seen_where_it_is_then() -> None:
+    stage = moving_stage("nothing", (0.5, 0.75))
+    place = UsdGeom.Mesh(stage.GetPrimAtPath("/wall")).AddTranslateOp()
+    for frame, x in ((5.0, 0.0), (5.4, 1.0), (5.6, 1.0), (5.65, 1.0), (5.9, 1.0)):
+        place.Set(Gf.Vec3d(x, 0, 0), frame)
+    session = opened(stage)
+    (only,) = moments(session, 8)
+    assert only.session is not session and only.session.quality == session.quality
+    assert coverage(session, 8).sum() == pytest.approx(24, abs=0.2)  # of 32 columns; 16 at the frame itself
+
+
 def test_moments_that_are_the_same_are_one_and_share_what_they_can() -> None:
     stage = moving_stage("nothing", (0.0, 1.0))
     aperture = UsdGeom.Camera(stage.GetPrimAtPath("/camera")).GetHorizontalApertureAttr()
