@@ -69,7 +69,9 @@ def shaping_factor(shaping: Table, axis: F64, to_local: F64, wx: float, wy: floa
     """Factor of what a light emits against a unit direction: colour (3)."""
     cosine = min(max(axis[0] * wx + axis[1] * wy + axis[2] * wz, -1.0), 1.0)
     level = 1.0 - _smooth_step(math.acos(cosine), shaping.cone[0], shaping.cone[1])
-    if level > 0.0 and len(shaping.horizontal) > 0:
+    if level <= 0.0:
+        return 0.0, 0.0, 0.0
+    if len(shaping.horizontal) > 0:
         x = to_local[0, 0] * wx + to_local[0, 1] * wy + to_local[0, 2] * wz
         y = to_local[1, 0] * wx + to_local[1, 1] * wy + to_local[1, 2] * wz
         z = to_local[2, 0] * wx + to_local[2, 1] * wy + to_local[2, 2] * wz
@@ -115,6 +117,9 @@ def shape_places(
     for i in prange(len(row)):
         if known[i] < 0:
             continue
+        target = row[i]
+        if out[target, 0] == 0.0 and out[target, 1] == 0.0 and out[target, 2] == 0.0:
+            continue
         k, run, lane = known[i] // STATES, i // RUN, i % RUN
         wx, wy, wz = float(points[k, 0]), float(points[k, 1]), float(points[k, 2])
         if not distant:
@@ -125,7 +130,6 @@ def shape_places(
         if length == 0.0:
             continue
         r, g, b = shaping_factor(shaping, axis, to_local, wx / length, wy / length, wz / length)
-        target = row[i]
         out[target, 0] *= r
         out[target, 1] *= g
         out[target, 2] *= b

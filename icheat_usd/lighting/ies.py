@@ -67,7 +67,7 @@ def read_profile(content: bytes, name: str) -> Profile:
         It is no such file, is cut short, has angles out of order or values that cannot be, or is of type A or B.
     """
     numbers = _Numbers(content, name)
-    n_lamps, _lumens, multiplier = numbers.take(3, "lamps, lumens and multiplier")
+    _lamps, _lumens, multiplier = numbers.take(3, "lamps, lumens and multiplier")
     counts = numbers.take(2, "numbers of angles")
     n_v, n_h = (int(count) for count in counts)
     if (counts != np.rint(counts)).any() or n_v < 2 or n_h < 1 or n_v * n_h > MOST_VALUES:
@@ -79,9 +79,11 @@ def read_profile(content: bytes, name: str) -> Profile:
     ballast, factor, _watts = numbers.take(3, "ballast factors")
     vertical = _angles(numbers.take(n_v, "vertical angles"), 180.0, f"{name}: vertical angles")
     horizontal = _angles(numbers.take(n_h, "horizontal angles"), 360.0, f"{name}: horizontal angles")
-    intensity = numbers.take(n_v * n_h, "intensities").reshape(n_h, n_v) * (multiplier * ballast * factor)
-    if not (intensity >= 0.0).all():
-        raise ProfileError(f"{name} has a negative intensity; export it again")
+    intensity = numbers.take(n_v * n_h, "intensities").reshape(n_h, n_v)
+    with np.errstate(over="ignore", invalid="ignore"):
+        intensity = intensity * (multiplier * ballast * factor)
+    if not (np.isfinite(intensity) & (intensity >= 0.0)).all():
+        raise ProfileError(f"{name} has a negative or infinite intensity; export it again")
     horizontal, intensity = _all_round(horizontal, intensity, name)
     return Profile(np.radians(vertical), np.radians(horizontal), np.ascontiguousarray(intensity))
 
@@ -125,7 +127,7 @@ def _angles(angles: F64, highest: float, what: str) -> F64:
 
 
 def _all_round(angles: F64, intensity: F64, name: str) -> tuple[F64, F64]:
-    """Horizontal angles over a whole turn: those of an eighth... of a symmetric luminaire mirrored."""
+    """Horizontal angles over a whole turn: what a symmetric luminaire leaves out is mirrored."""
     first, last = float(angles[0]), float(angles[-1])
     if len(angles) == 1:
         return np.array([0.0, 360.0]), np.repeat(intensity, 2, axis=0)

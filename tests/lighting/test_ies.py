@@ -69,7 +69,8 @@ def test_older_files_and_tilts_are_read() -> None:
         (profile_text((0, 90, 200), (0,), [3, 2, 1]), "vertical angles do not ascend"),
         (profile_text(DOWN, (0, 30, 70), 1.0), "horizontal angles end at 70"),
         (profile_text(DOWN, (20, 30, 70), 1.0), "no symmetry"),
-        (profile_text(DOWN, (0,), [3, -2, 1]), "negative intensity"),
+        (profile_text(DOWN, (0,), [3, -2, 1]), "negative or infinite intensity"),
+        (profile_text(DOWN, (0,), [3, 2, 1], multiplier=1e308, ballast=100), "negative or infinite intensity"),
         (profile_text(DOWN, (0,), [3, 2, 1], kind=2), "type B; only type C"),
         (profile_text(DOWN, (0,), [3, 2, 1], kind=3), "type A; only type C"),
         (profile_text(DOWN, (0,), [3, 2, 1]).replace(" 3 1 1 2", " 3000000 3000000 1 2"), "x 3e\\+06 angles"),
@@ -81,3 +82,26 @@ def test_damage_is_named(text: str, says: str) -> None:
     with pytest.raises(ProfileError, match=says) as error:
         read_profile(text.encode("latin-1"), "lamp.ies")
     assert "lamp.ies" in str(error.value)
+
+
+def test_mutated_files_are_read_or_refused_in_one_sentence() -> None:
+    whole = profile_text(
+        (0, 30, 60, 90), (0, 45, 90), np.arange(12).reshape(3, 4), tilt="INCLUDE\n1 2 0 90 1 1"
+    ).encode()
+    rng = np.random.default_rng(5)
+    n_read = 0
+    for _ in range(2000):
+        damaged = bytearray(whole)
+        for place in rng.integers(100, len(whole), rng.integers(1, 4)):
+            damaged[place] = rng.choice(np.frombuffer(b"0123456789.-e \n,x", np.uint8))
+        cut = bytes(damaged[: rng.integers(150, len(damaged) + 60)])
+        try:
+            profile = read_profile(cut, "lamp.ies")
+        except ProfileError as error:
+            assert "lamp.ies" in str(error) and "\n" not in str(error)
+            continue
+        n_read += 1
+        assert np.isfinite(profile.intensity).all() and (profile.intensity >= 0).all()
+        assert (np.diff(profile.vertical) >= 0).all() and (np.diff(profile.horizontal) > 0).all()
+        assert profile.horizontal[-1] - profile.horizontal[0] == pytest.approx(2 * np.pi)
+    assert 50 < n_read < 1950
