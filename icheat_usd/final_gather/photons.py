@@ -10,7 +10,7 @@ multipliers of lights count. Edits are never seen here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +34,9 @@ from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 from icheat_usd.tracing.paths import MAX_LAYERS, passing_materials
 
 _AT_ONCE = 1 << 18  # photons in flight, to bound memory
-_PILOT = 4096  # photons that measure the power of a light
+_PILOT = 1 << 15  # photons that find out what of a light gets where it matters
+_GRID = 32  # cells on a side of what is learnt of a light
+_BLIND_SHARE = 0.25  # of the photons that do not go where the pilot found light
 _EQUAL_SHARE = 0.25  # of the photons, the same number for every light: each may be looked at alone
 
 # Photons start this share of the scene's radius from an analytic light: such lights are often authored in the plane
@@ -78,22 +80,25 @@ def trace_photons(
 ) -> Photons:
     """Photons of all lights, direct ones included.
 
-    Lights share the photons by their power, a quarter equally. Each photon is a path that ends by
-    Russian roulette or after `n_bounces` arrivals; random numbers depend on (seed, light, photon, bounce) alone.
+    Lights share the photons by the light that arrives after a reflection, a quarter equally. Each photon is a
+    path that ends by Russian roulette or after `n_bounces` arrivals; random numbers depend on (seed, light, photon,
+    bounce) alone.
 
     Notes
     -----
-    Light from infinitely far, of distant lights and domes, aims at the bounding sphere of the scene. In a
-    wide landscape, or an interior that is lit through windows, most of it is spent outside.
+    Light from infinitely far, of distant lights and domes, starts on a disk as wide as the scene. A pilot finds
+    out where on it sunlight gets into a room, and from which directions that of domes does (lamps: into which); three
+    quarters of the photons go there. Of a dome over a wide landscape most of the rest is spent outside.
     """
     found: list[Photons] = []
-    shares = _shares(snapshot, sampler, settings)
+    aims = [_learn(snapshot, tracer, sampler, settings, light) for light in range(len(snapshot.lights.kind))]
+    shares = _shares(aims, settings)
     done, total = 0, max(int(shares.sum()), 1)
     for light, n in enumerate(shares.tolist()):
         for first in range(0, n, _AT_ONCE):
             progress("trace photons", done / total)
             count = min(_AT_ONCE, n - first)
-            own = _Bundle(snapshot, tracer, sampler, settings, light, first, n, count)
+            own = _Bundle(snapshot, tracer, sampler, settings, light, first, n, count, aims[light])
             found += own.trace()
             done += count
     progress("trace photons", 1.0)
@@ -104,48 +109,85 @@ def trace_photons(
     return Photons(*columns)
 
 
-def light_powers(snapshot: SceneSnapshot, sampler: LightSampler, seed: int) -> F64:
-    """Power that each light emits, (n_lights, 3); of light from infinitely far what enters the bounding sphere."""
-    powers = np.zeros((len(snapshot.lights.kind), 3))
-    for light in range(len(powers)):
-        powers[light] = _emit(snapshot, sampler, light, 0, _PILOT, _PILOT, seed)[2].sum(axis=0, dtype=np.float64)
-    return powers
+class _Aim(NamedTuple):
+    """Where photons of a light are sent: cumulative distributions on a grid of the unit square."""
+
+    rows: F64  #: (n,)
+    cells: F64  #: (n, n) in each row
+    useful: float  #: power that arrives after a reflection
 
 
-def _shares(snapshot: SceneSnapshot, sampler: LightSampler, settings: PhotonSettings) -> I64:
+def _aim(weight: F64) -> _Aim:
+    """Aim by weights (n, n), of which the neighbours of a cell have a share: a pilot does not find everything."""
+    near = sum(np.roll(weight, (x, y), (0, 1)) for x in (-1, 0, 1) for y in (-1, 0, 1)) / 9
+    mean = float(weight.mean())
+    density = _BLIND_SHARE + (1 - _BLIND_SHARE) * (near / mean if mean > 0 else np.ones_like(weight))
+    cells = np.cumsum(density, axis=1)
+    rows = np.cumsum(cells[:, -1])
+    cells, rows = cells / cells[:, -1:], rows / rows[-1]
+    return _Aim(rows, np.ascontiguousarray(cells), float(weight.sum()))
+
+
+def _learn(
+    snapshot: SceneSnapshot, tracer: Tracer, sampler: LightSampler, settings: PhotonSettings, light: int
+) -> _Aim:
+    """Find out with some photons of a light which of them are worth tracing."""
+    anywhere = _aim(np.zeros((_GRID, _GRID)))
+    pilot = replace(settings, seed=int(hash_combine(settings.seed, 0x9F)))
+    bundle = _Bundle(snapshot, tracer, sampler, pilot, light, 0, _PILOT, _PILOT, anywhere)
+    arrived = bundle.trace()
+    # Direct light is found by shadow rays; it counts where nothing else arrives.
+    later = arrived[1:] or arrived
+    if not later:
+        return anywhere
+    power = np.concatenate([one.power.mean(axis=1, dtype=np.float64) for one in later])
+    photon = np.concatenate(bundle.arrivals[-len(later) :])
+    found = np.bincount(bundle.cell[photon], power, _GRID * _GRID).astype(np.float64)
+    return _aim(found.reshape(_GRID, _GRID))
+
+
+def _shares(aims: list[_Aim], settings: PhotonSettings) -> I64:
     """Photons of each light."""
-    power = light_powers(snapshot, sampler, int(hash_combine(settings.seed, 0x9F))).mean(axis=1)
-    shining = power > 0
+    useful = np.array([aim.useful for aim in aims])
+    shining = useful > 0
     if not shining.any():
-        return np.zeros(len(power), np.int64)
-    share = (1 - _EQUAL_SHARE) * power / power.sum() + _EQUAL_SHARE * shining / shining.sum()
+        return np.zeros(len(aims), np.int64)
+    share = (1 - _EQUAL_SHARE) * useful / useful.sum() + _EQUAL_SHARE * shining / shining.sum()
     return np.ceil(settings.n_emitted * share).astype(np.int64)
 
 
 def _emit(
-    snapshot: SceneSnapshot, sampler: LightSampler, light: int, first: int, count: int, total: int, seed: int
-) -> tuple[F32, F32, F32]:
-    """Where photons of a light start, their directions and their power."""
+    snapshot: SceneSnapshot,
+    sampler: LightSampler,
+    light: int,
+    first: int,
+    count: int,
+    total: int,
+    seed: int,
+    aim: _Aim,
+) -> tuple[F32, F32, F32, I32]:
+    """Where photons of a light start, their directions and power, and the cells that they were aimed at."""
     lights = snapshot.lights
     origin, direction = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     power = np.zeros((count, 3), np.float32)
+    cell = np.zeros(count, np.int32)
     diffuse = np.float32(snapshot.controls(light).diffuse)
     if not nonzero_rows(lights.radiance[light : light + 1])[0]:
-        return origin, direction, power
+        return origin, direction, power, cell
     if lights.kind[light] != LightKind.MESH:
         radius = float(snapshot.radius)
         kernels.emit_from_shape(
-            lights, snapshot.textures, sampler.tables, light, radius, _CLEARANCE * radius, first, total, seed,
-            origin, direction, power,
+            lights, snapshot.textures, sampler.tables, light, radius, _CLEARANCE * radius, aim.rows, aim.cells, first,
+            total, seed, origin, direction, power, cell,
         )  # fmt: skip
         shape(snapshot, light, -direction, power)
-        return origin, direction, power * diffuse
+        return origin, direction, power * diffuse, cell
     row, barycentric, side = np.zeros(count, np.int64), np.zeros((count, 2), np.float32), np.zeros(count, np.uint8)
     kernels.emit_from_mesh(lights, sampler.tables, light, first, total, seed, row, barycentric, side, power)
     instance, triangle = lights.triangle_instance[row], lights.triangle[row]
     start = points_on_surface(snapshot, instance, triangle, barycentric, side)
     kernels.directions_from_mesh(start.normal, light, first, seed, direction)
-    return spawn_points(snapshot, start, direction), direction, power * diffuse * start.emission
+    return spawn_points(snapshot, start, direction), direction, power * diffuse * start.emission, cell
 
 
 class _Bundle:
@@ -161,13 +203,15 @@ class _Bundle:
         first: int,
         total: int,
         count: int,
+        aim: _Aim,
     ) -> None:
         self.snapshot, self.tracer, self.light, self.n_bounces = snapshot, tracer, light, settings.n_bounces
         self.seed = int(hash_combine(hash_combine(settings.seed, 0xA0), light))
-        self.origin, self.direction, self.power = _emit(
-            snapshot, sampler, light, first, count, total, settings.seed & 0xFFFFFFFF
+        self.origin, self.direction, self.power, self.cell = _emit(
+            snapshot, sampler, light, first, count, total, settings.seed & 0xFFFFFFFF, aim
         )
         self.photon = np.arange(first, first + count, dtype=np.int32)
+        self.arrivals: list[I32] = []  #: numbers of the photons that arrived, bounce by bounce
 
     def trace(self) -> list[Photons]:
         """What arrives, bounce by bounce."""
@@ -194,6 +238,7 @@ class _Bundle:
             self.power = power
             # A see-through surface stops a photon by chance, but reflects what arrives for those who hit it by chance.
             whole = (self.power / np.maximum(points.opacity, np.float32(1e-3))[:, None]).astype(np.float32)
+            self.arrivals.append(self.photon)
             arrived.append(
                 Photons(
                     points.position,

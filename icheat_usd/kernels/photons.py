@@ -87,16 +87,36 @@ def _place_on_shape(kind: int, m: Floats, a: float, b: float, u: float, v: float
     return px + m[3], py + m[7], pz + m[11], nx, ny, nz, scale * measure
 
 
+@kernel
+def _aimed(rows: F64, cells: F64, u: float, v: float) -> tuple[float, float, float, int]:
+    """The unit square warped to a density on a grid: place (2), density, cell.
+
+    `rows` and `cells` (n, n) are cumulative, over the first coordinate and, in each row, the second.
+    """
+    n = rows.shape[0]
+    i = search_cdf(rows, 0, n, u)
+    below = rows[i - 1] if i > 0 else 0.0
+    p = rows[i] - below
+    x = (i + min(max((u - below) / p, 0.0), 1.0)) / n
+    column = cells[i]
+    j = search_cdf(column, 0, n, v)
+    below = column[j - 1] if j > 0 else 0.0
+    q = column[j] - below
+    y = (j + min(max((v - below) / q, 0.0), 1.0)) / n
+    return x, y, p * q * n * n, i * n + j
+
+
 @parallel_kernel
 def emit_from_shape(
-    lights: Table, textures: Table, tables: Table, light: int, scene_radius: float, clearance: float, first: int,
-    n_total: int, seed: int, position: F32, direction: F32, power: F32,
+    lights: Table, textures: Table, tables: Table, light: int, scene_radius: float, clearance: float, rows: F64,
+    cells: F64, first: int, n_total: int, seed: int, position: F32, direction: F32, power: F32, cell: Numbers,
 ) -> None:  # fmt: skip
     """Photons ``first``, ``first + 1``, ... of the `n_total` of a light that is no mesh.
 
     `power` receives the flux that each stands for, 0 where there is none. Light from infinitely far
     starts on a disk as wide as the scene's bounding sphere about the origin, before it; other photons
-    `clearance` metres from their light, which may lie in the plane of a ceiling.
+    `clearance` metres from their light, which may lie in the plane of a ceiling. `rows` and `cells` aim the
+    places of distant lights on that disk and the directions of others: see `_aimed`; `cell` receives the one chosen.
     """
     kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
     texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
@@ -106,6 +126,10 @@ def emit_from_shape(
         u, v = sobol_pair(first + i, places)
         s, t = sobol_pair(first + i, directions)
         u, v, s, t = float(u), float(v), float(s), float(t)
+        if kind == _DISTANT:
+            u, v, aim, cell[i] = _aimed(rows, cells, u, v)
+        else:
+            s, t, aim, cell[i] = _aimed(rows, cells, s, t)
         red, green, blue = 1.0, 1.0, 1.0
         if kind == _DISTANT or kind == _DOME:
             if kind == _DOME and image[0] < 0:
@@ -131,7 +155,7 @@ def emit_from_shape(
             if kind == _RECT and image[0] >= 0:
                 # upright for who looks at its lit side
                 red, green, blue = image_bilinear(texels, image[0], image[1], image[2], 1.0 - u, 1.0 - v, False)
-        weight /= n_total
+        weight /= n_total * aim
         position[i, 0] = px
         position[i, 1] = py
         position[i, 2] = pz
