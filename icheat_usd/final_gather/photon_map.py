@@ -28,7 +28,7 @@ _AT_ONCE = 1 << 14  # density estimates, to bound memory
 _FLATNESS = 5.0  # photons off the plane of a place are as far as others at this multiple of their height
 _SAME_PLANE = 0.9  # cosine between the normals of a place and of its photons
 _SAME_SIDE = 0.7  # cosine between the normals of a place and of the irradiance that stands for it
-_SITES = 4  # irradiance is kept at every fourth photon
+_SITES_PER_ESTIMATE = 16  # irradiance is kept where that many photons share those that it is estimated from
 _PROBES = 16  # places where the kernel looks for its surface
 _LIFT = 0.02  # segments that tell what a place sees run so far above the surface, in radii of the kernel
 _LEAST_COVERAGE = 1.0 / _PROBES
@@ -196,16 +196,18 @@ def build_photon_map(
     photons : Photons
         All that shall count: direct ones only where no shadow rays find direct light.
     sites : bool
-        Whether to keep irradiance at every fourth photon, for `PhotonMap.irradiance`.
+        Whether to keep irradiance at some of the photons, for `PhotonMap.irradiance`.
     """
-    order = _morton_order(photons.position)
+    order = _morton_order(photons.position, photons.normal)
     photons = photons.take(order)
     n_lights = len(snapshot.lights.kind)
     tree = _tree(photons.position, photons.normal)
     plain = PhotonMap(snapshot, tracer, settings, photons, tree, n_lights)
     if not sites:
         return plain
-    position, normal = photons.position[::_SITES].copy(), photons.normal[::_SITES].copy()
+    # Every fourth photon, as in Christensen's paper, where estimates are of 64.
+    stride = max(1, settings.n_nearest // _SITES_PER_ESTIMATE)
+    position, normal = photons.position[::stride].copy(), photons.normal[::stride].copy()
     kept = Sites(_tree(position, normal), *plain._estimates(position, normal))
     return PhotonMap(snapshot, tracer, settings, photons, tree, n_lights, kept)
 
@@ -268,16 +270,16 @@ def photon_cell_radiance(
 def _tree(position: F32, normal: F32) -> kernels.PhotonTree:
     """Tree over points in Morton order."""
     n_leaves = 1 << max(-(-len(position) // kernels.LEAF) - 1, 0).bit_length()
-    box = np.empty((2 * n_leaves, 6), np.float32)
-    kernels.fill_boxes(position, n_leaves, box)
+    box = np.empty((2 * n_leaves, 12), np.float32)
+    kernels.fill_boxes(position, normal, n_leaves, box)
     return kernels.PhotonTree(position, normal, box, n_leaves)
 
 
-def _morton_order(position: F32) -> I32:
-    """Order of points along a Morton curve."""
+def _morton_order(position: F32, normal: F32) -> I32:
+    """Order of points along a Morton curve, once for each of six directions."""
     code = np.empty(len(position), np.uint64)
     if not len(code):
         return np.zeros(0, np.int32)
     low, high = position.min(axis=0).astype(np.float64), position.max(axis=0).astype(np.float64)
-    kernels.morton_codes(position, low, 2097152.0 / max(float((high - low).max()), 1e-30), code)
+    kernels.morton_codes(position, normal, low, 524288.0 / max(float((high - low).max()), 1e-30), code)
     return np.argsort(code, kind="stable").astype(np.int32)

@@ -25,17 +25,21 @@ class PhotonTree(NamedTuple):
 
     position: F32  #: (n, 3)
     normal: F32  #: (n, 3) unit
-    box: F32  #: (2 * n_leaves, 6) lowest and highest corner; an empty box is inverted
+    box: F32  #: (2 * n_leaves, 12) lowest and highest corner, and those of the normals; an empty box is inverted
     n_leaves: int  #: a power of two
 
 
 @parallel_kernel
-def morton_codes(position: F32, low: np.ndarray, scale: float, out: np.ndarray) -> None:
-    """63-bit Morton codes of points; `scale` takes metres to 2^21 cells."""
+def morton_codes(position: F32, normal: F32, low: np.ndarray, scale: float, out: np.ndarray) -> None:
+    """Morton codes of points, those of one axis-aligned direction together; `scale` takes metres to 2^19 cells."""
     for i in prange(position.shape[0]):
-        code = np.uint64(0)
+        facing, most = 0, np.float32(0.0)
         for c in range(3):
-            x = np.uint64(min(max((np.float64(position[i, c]) - low[c]) * scale, 0.0), 2097151.0))
+            if abs(normal[i, c]) > most:
+                facing, most = 2 * c + (1 if normal[i, c] > 0.0 else 0), abs(normal[i, c])
+        code = np.uint64(facing) << np.uint64(60)
+        for c in range(3):
+            x = np.uint64(min(max((np.float64(position[i, c]) - low[c]) * scale, 0.0), 524287.0))
             x = (x | (x << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
             x = (x | (x << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
             x = (x | (x << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
@@ -46,24 +50,33 @@ def morton_codes(position: F32, low: np.ndarray, scale: float, out: np.ndarray) 
 
 
 @kernel
-def fill_boxes(position: F32, n_leaves: int, box: F32) -> None:
+def fill_boxes(position: F32, normal: F32, n_leaves: int, box: F32) -> None:
     """Boxes of the leaves, then of what is above them."""
     for node in range(2 * n_leaves - 1, 0, -1):
-        for c in range(3):
-            low, high = np.float32(np.inf), np.float32(-np.inf)
-            if node >= n_leaves:
-                begin = (node - n_leaves) * LEAF
-                for i in range(begin, min(begin + LEAF, position.shape[0])):
-                    low, high = min(low, position[i, c]), max(high, position[i, c])
-            else:
-                low = min(box[2 * node, c], box[2 * node + 1, c])
-                high = max(box[2 * node, c + 3], box[2 * node + 1, c + 3])
-            box[node, c] = low
-            box[node, c + 3] = high
+        for part in range(2):
+            values = position if part == 0 else normal
+            for c in range(3):
+                low, high, first = np.float32(np.inf), np.float32(-np.inf), 6 * part + c
+                if node >= n_leaves:
+                    begin = (node - n_leaves) * LEAF
+                    for i in range(begin, min(begin + LEAF, values.shape[0])):
+                        low, high = min(low, values[i, c]), max(high, values[i, c])
+                else:
+                    low = min(box[2 * node, first], box[2 * node + 1, first])
+                    high = max(box[2 * node, first + 3], box[2 * node + 1, first + 3])
+                box[node, first] = low
+                box[node, first + 3] = high
 
 
 @kernel
-def _outside(box: F32, node: int, x: float, y: float, z: float) -> float:
+def _outside(box: F32, node: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, agree: float) -> float:
+    """Squared distance to a box; infinite if no normal in it agrees."""
+    best = max(nx * box[node, 6], nx * box[node, 9])
+    best += max(ny * box[node, 7], ny * box[node, 10])
+    best += max(nz * box[node, 8], nz * box[node, 11])
+    # not so in empty boxes, whose distance is infinite in any case
+    if best < agree:
+        return np.inf
     dx = max(box[node, 0] - x, x - box[node, 3], 0.0)
     dy = max(box[node, 1] - y, y - box[node, 4], 0.0)
     dz = max(box[node, 2] - z, z - box[node, 5], 0.0)
@@ -115,7 +128,7 @@ def _nearest(
     extra = flatness * flatness - 1.0
     depth = 0
     node = np.int64(1)
-    near = _outside(box, 1, x, y, z)
+    near = _outside(box, 1, x, y, z, nx, ny, nz, agree)
     while True:
         if near < (distance[0] if count == k else limit):
             if node >= n_leaves:
@@ -133,7 +146,8 @@ def _nearest(
                     elif d < distance[0]:
                         _sink(distance, index, count, d, i)
             else:
-                left, right = _outside(box, 2 * node, x, y, z), _outside(box, 2 * node + 1, x, y, z)
+                left = _outside(box, 2 * node, x, y, z, nx, ny, nz, agree)
+                right = _outside(box, 2 * node + 1, x, y, z, nx, ny, nz, agree)
                 first = 2 * node if left <= right else 2 * node + 1
                 stack[depth] = 4 * node + 1 - first
                 bound[depth] = max(left, right)
