@@ -65,6 +65,11 @@ def reference(
     """What is on disk, after rendering more of it for at most `minutes`; two passes are made in any case.
 
     Files are replaced as a whole, one a minute, so a run that is broken off loses little.
+
+    Raises
+    ------
+    ValueError
+        Mitsuba's render is no image.
     """
     path = folder / f"{name}-{snapshot.camera.width}x{snapshot.camera.height}-{scene_key(snapshot, depth)}.npz"
     sums, samples, spent, n_passes = _read(path)
@@ -76,6 +81,8 @@ def reference(
     while samples < most_samples and (time.perf_counter() < deadline or not samples):
         both = [renderer.layers(renderer.most_samples, first + n_passes) for first in _FIRST_SEED]
         more = np.stack([[half.indirect, half.whole] for half in both]) * renderer.most_samples
+        if not np.isfinite(more).all():
+            raise ValueError(f"{name}: Mitsuba's render holds values that are no numbers, so it is no reference")
         sums = more if sums is None else sums + more
         samples, n_passes = samples + renderer.most_samples, n_passes + 1
         if time.perf_counter() > saved + 60:

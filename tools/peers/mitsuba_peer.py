@@ -206,7 +206,7 @@ def _meshes(mi: Any, snapshot: SceneSnapshot, material: int, part: Part) -> dict
     result: dict[str, Any] = {}
     for side in (1, -1) if emission.any() else (0,):
         properties = mi.Properties()
-        reflectance = _reflectance(mi, snapshot, material)
+        reflectance = _reflectance(mi, snapshot, material, part)
         properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}})
         if side:
             properties["emitter"] = mi.load_dict(
@@ -216,7 +216,8 @@ def _meshes(mi: Any, snapshot: SceneSnapshot, material: int, part: Part) -> dict
         textured = reflectance["type"] != "mesh_attribute"
         mesh = mi.Mesh(name, 3 * n, n, properties, smooth, textured)
         if not textured:
-            mesh.add_attribute("vertex_color", 3, np.ascontiguousarray(part.color).ravel())
+            colors = part.color[::3] if reflectance["name"] == "face_color" else part.color
+            mesh.add_attribute(reflectance["name"], 3, np.ascontiguousarray(colors).ravel())
         parameters = mi.traverse(mesh)
         positions = part.position + side * _SHEET * snapshot.radius * part.normal
         parameters["vertex_positions"] = np.ascontiguousarray(positions, dtype=np.float32).ravel()
@@ -230,11 +231,14 @@ def _meshes(mi: Any, snapshot: SceneSnapshot, material: int, part: Part) -> dict
     return result
 
 
-def _reflectance(mi: Any, snapshot: SceneSnapshot, material: int) -> dict[str, Any]:
+def _reflectance(mi: Any, snapshot: SceneSnapshot, material: int, part: Part) -> dict[str, Any]:
     materials, textures = snapshot.materials, snapshot.textures
     image = -1 if material < 0 else int(materials.texture[material, Texture.DIFFUSE])
     if image < 0:
-        return {"type": "mesh_attribute", "name": "vertex_color"}
+        # Colours of corners are interpolated by coordinates that Mitsuba finds anew, and that slivers do not have.
+        corners = part.color.reshape(-1, 3, 3)
+        even = bool((corners == corners[:, :1]).all())
+        return {"type": "mesh_attribute", "name": "face_color" if even else "vertex_color"}
     if materials.texture_channel[material, Texture.DIFFUSE] != -1:
         raise ValueError(f"{snapshot.material_paths[material]}: only RGB textures are exported")
     wraps = {0: "repeat", 1: "clamp", 2: "mirror"}
