@@ -135,7 +135,7 @@ class LiveStack:
 
     def _bind(self, stack: EditStack, light_paths: tuple[str, ...]) -> EditField:
         same = light_paths == self._snapshot.light_paths
-        snapshot = self._snapshot if same else replace(self._snapshot, light_paths=light_paths)
+        snapshot = self._snapshot if same else replace(self._snapshot, light_paths=light_paths, light_controls=())
         return bind(stack, snapshot, self._known)
 
     def _show(self, stack: EditStack, field: EditField, light_paths: tuple[str, ...]) -> Change | None:

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icheat_usd.edits.model import Edit, EditStack
 from icheat_usd.lighting import build_light_sampler, reflected_direct
 from icheat_usd.relight.lights import LiveLights
+from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.scene import PLAIN, LightControls, LightKind, SceneSnapshot
 from icheat_usd.transport import light_cells
 from tests.lighting.test_controls import EVEN, flags, profile
-from tests.pipeline import Pipeline
+from tests.pipeline import Pipeline, select
 from tests.relight.test_live_lights import DOME, RECT, SPHERE, build, down, moved, room, settle
 from tests.scenes import Light
 
@@ -105,6 +107,22 @@ def test_lights_keep_their_controls_when_they_change_and_others_come_and_go(scen
     lights.remove(1)
     lights.remove(0)
     assert lights.snapshot().light_controls == ()
+
+
+def test_a_view_is_edited_while_lights_come_and_go_among_linked_ones(scene: Pipeline) -> None:
+    lights = build(scene, linked(RECT, SPHERE))
+    of = Pipeline(linked(RECT, SPHERE), n_gather=100, rays=32, bounce_rays=32)
+    live = LiveRelighter(of.snapshot, scene.view, scene.gather, of.transport, lights)
+    everything = select(*(surface.path for surface in of.snapshot.surfaces))
+    edit = Edit("/all", "scale", {"gain": 2.0}, everything, select("/red"))
+    live.set_stack(EditStack("/stack", (edit,)))
+    before = live.frame()
+    lights.add("/new", LightKind.DISTANT, to_world=np.eye(3, 4), radiance=(3, 3, 3))
+    live.set_stack(EditStack("/stack", (replace(edit, lights=("/new",)),)))
+    assert (live.frame() != before).any()
+    lights.remove(0)
+    live.set_stack(EditStack("/stack", (edit,)))
+    assert np.isfinite(live.frame()).all()
 
 
 def test_plain_lights_have_the_bits_that_they_have_among_plain_ones(scene: Pipeline) -> None:
