@@ -179,6 +179,30 @@ def test_layers_of_lights_and_edits_add_up(shot: Path) -> None:
     np.testing.assert_allclose(film.mattes[0].ranks[..., 1].sum(axis=-1), 1.0, rtol=1e-6)
 
 
+def test_mattes_and_edits_of_a_moving_block_are_blurred_with_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moving = STAGE.replace("float focalLength", "double shutter:close = 1\n        float focalLength")
+    shot = make_stage(tmp_path, moving)
+    layers = [word for name in ("beauty", "edit_delta", "edits", "crypto_object") for word in ("--aov", name)]
+    command = ["render", str(shot), "--frame", "2", "-o", str(tmp_path / "f.exr"), *QUICK, "--samples", "4", *layers]
+    assert main(command) == 0
+    film = read_exr(tmp_path / "f.exr")
+    (matte,) = film.mattes
+    ids = matte.ranks[..., 0].view(np.uint32)
+    block = np.where(ids == int(matte.manifest["/World/Block"], 16), matte.ranks[..., 1], 0).sum(axis=-1)
+    assert np.isin(np.round(block * 4, 4), range(5)).all() and np.isin(block, (0.25, 0.5, 0.75)).any()
+    np.testing.assert_allclose(matte.ranks[..., 1].sum(axis=-1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(film.layer("edit.bleed"), film.layer("edit_delta"), atol=1e-6)
+    capsys.readouterr()
+    assert main([*command, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["images"][0]["kept"] == [str(tmp_path / "f.exr")]
+    (tmp_path / "still").mkdir()
+    still = make_stage(tmp_path / "still")
+    assert main([str(still) if word == str(shot) else word.replace("f.exr", "still.exr") for word in command]) == 0
+    assert not np.array_equal(read_exr(tmp_path / "still.exr").mattes[0].ranks, matte.ranks)
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_an_interrupted_sequence_keeps_its_finished_frames(tmp_path: Path) -> None:
     shot = make_stage(tmp_path, STAGE.replace("(16, 12)", "(64, 48)"))
