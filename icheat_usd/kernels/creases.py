@@ -1,4 +1,4 @@
-"""Rules of Catmull-Clark surfaces with edges and corners that are sharp to some degree.
+"""Rules of subdivision surfaces with edges and corners that are sharp to some degree.
 
 As in OpenSubdiv: a sharpness falls by one with each step; `INFINITE` stays, and
 boundaries have it. Within its last step an edge or vertex is a mixture of
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel
+from icheat_usd.kernels.loop import limit_weight, neighbour_weight
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -164,20 +165,20 @@ def find_fading(lo: I64, hi: I64, edges: F64, corners: F64, fading: NDArray[np.b
 
 @kernel
 def _limit_of_ring(
-    centre: F64, ends: F64, faces: F64, sharpness: F64, n_faces: I64, sides: I64, corner: float, out: F64
+    centre: F64, ends: F64, faces: F64, sharpness: F64, sides: I64, corner: float, is_loop: bool, out: F64
 ) -> None:
-    """Limit of one vertex of an all-quad mesh: steps of what is around it until only what lasts is sharp, then masks.
+    """Limit of one vertex of quads or (Loop) triangles: steps of its ring until only what lasts is sharp, then masks.
 
     Parameters
     ----------
     centre : (k,) changed
-    ends, sharpness, n_faces : (n_edges, k), (n_edges,), (n_edges,) changed
+    ends, sharpness : (n_edges, k), (n_edges,) changed
         Of the edges at the vertex.
-    faces, sides : (n_quads, k), (n_quads, 2) changed, not changed
-        The vertices opposite in the quads at it, and which two edges each quad has.
+    faces, sides : (n_faces, k), (n_faces, 2) changed, not changed
+        The vertices opposite in the quads at it, and which two edges each face has.
     out : (k,) out
     """
-    n_edges, n_quads, width = len(ends), len(faces), len(centre)
+    n_edges, n_around, width = len(ends), len(faces), len(centre)
     middle, ring = np.empty((n_edges, width)), np.empty((n_edges, width))
     curve, total, mean = np.empty(width), np.empty(width), np.empty(width)
     for step in range(_STEPS_OF_DART):
@@ -204,41 +205,57 @@ def _limit_of_ring(
 
         ring[:] = 0.0
         total[:] = 0.0
-        for q in range(n_quads):
-            faces[q] = 0.25 * (centre + faces[q] + ends[sides[q, 0]] + ends[sides[q, 1]])
-        for q in range(n_quads):
-            ring[sides[q, 0]] += faces[q]
-            ring[sides[q, 1]] += faces[q]
-            total += faces[q]
         mean[:] = 0.0
         for e in range(n_edges):
             middle[e] = 0.5 * (centre + ends[e])
-            mean += middle[e]
-        d = float(n_quads)
-        total = (total / d + 2.0 * mean / n_edges + (d - 3.0) * centre) / d
+            mean += middle[e] / n_edges
+            total += ends[e]
+        if is_loop:
+            for q in range(n_around):
+                ring[sides[q, 0]] += ends[sides[q, 1]]
+                ring[sides[q, 1]] += ends[sides[q, 0]]
+            share = neighbour_weight(n_edges)
+            total[:] = (1.0 - n_edges * share) * centre + share * total
+            ring[:] = 0.75 * middle + 0.125 * ring
+        else:
+            total[:] = 0.0
+            for q in range(n_around):
+                faces[q] = 0.25 * (centre + faces[q] + ends[sides[q, 0]] + ends[sides[q, 1]])
+            for q in range(n_around):
+                ring[sides[q, 0]] += faces[q]
+                ring[sides[q, 1]] += faces[q]
+                total += faces[q]
+            d = float(n_around)
+            total[:] = (total / d + 2.0 * mean + (d - 3.0) * centre) / d
+            ring[:] = 0.5 * middle + 0.25 * ring
         centre[:] = smooth * total + crease * (0.75 * centre + 0.125 * curve) + (1.0 - smooth - crease) * centre
         for e in range(n_edges):
             keep = min(sharpness[e], 1.0)
-            ends[e] = keep * middle[e] + (1.0 - keep) * (0.5 * middle[e] + 0.25 * ring[e])
+            ends[e] = keep * middle[e] + (1.0 - keep) * ring[e]
             sharpness[e] = after_step(sharpness[e])
         corner = after_step(corner)
 
-    d = float(n_quads)
-    total[:] = d * d * centre
-    for q in range(n_quads):
-        total += faces[q]
+    total[:] = 0.0
     for e in range(n_edges):
-        total += 4.0 * ends[e]
-    out[:] = smooth * total / (d * (d + 5.0)) + crease * (4.0 * centre + curve) / 6.0
-    out += (1.0 - smooth - crease) * centre
+        total += ends[e]
+    if is_loop:
+        share = limit_weight(n_edges)
+        total[:] = (1.0 - n_edges * share) * centre + share * total
+    else:
+        d = float(n_around)
+        total[:] = 4.0 * total + d * d * centre
+        for q in range(n_around):
+            total += faces[q]
+        total /= d * (d + 5.0)
+    out[:] = smooth * total + crease * (4.0 * centre + curve) / 6.0 + (1.0 - smooth - crease) * centre
 
 
 @kernel
 def limits_where_fading(
-    vertices: F64, indices: I64, of_corner: I64, edges: F64, corners: F64, n_faces: I64, fading: I64, begin: I64,
-    corner_of: I64, out: F64,
+    vertices: F64, indices: I64, of_corner: I64, edges: F64, corners: F64, fading: I64, begin: I64, corner_of: I64,
+    size: int, out: F64,
 ) -> None:  # fmt: skip
-    """Limit positions of some vertices of an all-quad mesh; the faces around a vertex decide where it ends up.
+    """Limit positions of some vertices; the faces around a vertex decide where it ends up.
 
     Parameters
     ----------
@@ -248,22 +265,24 @@ def limits_where_fading(
         The vertices.
     begin, corner_of : (m + 1,), (n,)
         Corners of each: ``corner_of[begin[i] : begin[i + 1]]``.
+    size
+        Corners of every face: 4, or 3 for Loop's scheme.
     out : (n_vertices, k)
         Their rows are written.
     """
     width = vertices.shape[1]
     for i in range(len(fading)):
         v = fading[i]
-        n_quads = begin[i + 1] - begin[i]
-        known = np.empty(2 * n_quads, np.int64)
-        ends, faces = np.empty((2 * n_quads, width)), np.empty((n_quads, width))
-        sides = np.empty((n_quads, 2), np.int64)
+        n_around = begin[i + 1] - begin[i]
+        known = np.empty(2 * n_around, np.int64)
+        ends, faces = np.empty((2 * n_around, width)), np.empty((n_around, width))
+        sides = np.empty((n_around, 2), np.int64)
         n_edges = 0
-        for q in range(n_quads):
+        for q in range(n_around):
             c = corner_of[begin[i] + q]
-            first = c - c % 4
-            ahead, behind = first + (c + 1) % 4, first + (c + 3) % 4
-            faces[q] = vertices[indices[first + (c + 2) % 4]]
+            first, place = c - c % size, c % size
+            ahead, behind = first + (place + 1) % size, first + (place + size - 1) % size
+            faces[q] = vertices[indices[first + (place + 2) % size]]
             for side, edge, other in ((0, of_corner[c], indices[ahead]), (1, of_corner[behind], indices[behind])):
                 slot = 0
                 while slot < n_edges and known[slot] != edge:
@@ -274,7 +293,7 @@ def limits_where_fading(
                     n_edges += 1
                 sides[q, side] = slot
         rows = known[:n_edges]
-        _limit_of_ring(vertices[v].copy(), ends[:n_edges], faces, edges[rows], n_faces[rows], sides, corners[v], out[v])
+        _limit_of_ring(vertices[v].copy(), ends[:n_edges], faces, edges[rows], sides, corners[v], size == 3, out[v])
 
 
 @kernel

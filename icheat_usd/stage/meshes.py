@@ -180,8 +180,8 @@ def _build(control: _ControlMesh) -> TriangleMesh | None:
     cage = _only(cage, control.counts >= 3)
     if not len(cage.counts):
         return None
-    if control.scheme in ("catmullClark", "bilinear"):
-        cage = refine(cage, control.level, smooth=control.scheme == "catmullClark", sharp_corners=control.sharp_corners)
+    if control.scheme != "none":
+        cage = refine(cage, control.level, control.scheme, sharp_corners=control.sharp_corners)
     shown = control.shown[cage.face]
     smooth: tuple[F64, I64] | None = None  # normals, and the row of each corner
     if control.scheme in ("catmullClark", "loop"):
@@ -281,18 +281,19 @@ def _read_control_mesh(
         moved = deformation.points(points)
         points, deformation = (points, None) if moved is None else (moved, deformation)
     scheme = str(mesh.GetSubdivisionSchemeAttr().Get(time) or "catmullClark")
-    if scheme == "loop":
-        report(prim, "subdivisionScheme loop", "Loop subdivision is not supported; the control mesh is used, smoothed.")
-    elif scheme not in ("none", "catmullClark", "bilinear"):
+    if scheme == "loop" and (counts > 3).any():
+        report(prim, "subdivisionScheme loop", "a face is no triangle; the mesh is refined by catmullClark.")
+        scheme = "catmullClark"
+    elif scheme not in ("none", "catmullClark", "bilinear", "loop"):
         report(prim, "subdivisionScheme", f"'{scheme}' is no subdivision scheme; the mesh is taken as polygons.")
         scheme = "none"
     boundary = str(mesh.GetInterpolateBoundaryAttr().Get(time))
     creases, shown = NO_CREASES, _shown_faces(mesh, time, len(counts), report)
-    if scheme == "catmullClark":
+    if scheme in ("catmullClark", "loop"):
         creases = read_creases(mesh, time, counts, indices, report)
         if boundary == "none":
             shown &= ~faces_without_a_surface(counts, indices, creases)
-    refined = scheme in ("catmullClark", "bilinear")
+    refined = scheme != "none"
 
     sizes = Topology(len(points), counts, indices)
     rows = materials.rows(len(counts))

@@ -1,4 +1,4 @@
-"""Catmull-Clark surfaces, refined a few times and then set on their limit.
+"""Catmull-Clark and Loop surfaces, refined a few times and then set on their limit.
 
 OpenSubdiv does not come with the ``usd-core`` wheel, and no light package has
 it. Its rules are followed: boundaries by ``interpolateBoundary``, creases and
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.kernels import creases, meshing
+from icheat_usd.kernels import creases, loop, meshing
 from icheat_usd.scene import F64, I64
 
 #: From here on, an edge or corner is sharp for ever: USD's SHARPNESS_INFINITE.
@@ -41,7 +41,7 @@ class Cage(NamedTuple):
     creases: Creases = NO_CREASES
 
 
-def refine(cage: Cage, level: int, *, smooth: bool = True, sharp_corners: bool = True) -> Cage:
+def refine(cage: Cage, level: int, scheme: str = "catmullClark", *, sharp_corners: bool = True) -> Cage:
     """Subdivide `level` times and move the vertices to the limit surface.
 
     Parameters
@@ -49,9 +49,9 @@ def refine(cage: Cage, level: int, *, smooth: bool = True, sharp_corners: bool =
     cage
         The control mesh.
     level
-        How often each face is split; every face becomes quads. 0 returns the cage.
-    smooth
-        False keeps the shape (USD's ``bilinear`` scheme).
+        How often each face is split; every face becomes quads, or triangles by Loop's scheme. 0 returns the cage.
+    scheme
+        "catmullClark"; "bilinear", which keeps the shape; or "loop", for faces that all are triangles.
     sharp_corners
         USD's ``edgeAndCorner``: boundary vertices of a single face stay where they are.
 
@@ -66,11 +66,13 @@ def refine(cage: Cage, level: int, *, smooth: bool = True, sharp_corners: bool =
     .. [1] Catmull and Clark, CAD 10(6), 1978.
     .. [2] Halstead, Kass and DeRose, SIGGRAPH 1993: limit positions.
     .. [3] DeRose, Kass and Truong, SIGGRAPH 1998: sharpness.
+    .. [4] Loop, master's thesis, University of Utah, 1987.
     """
+    is_loop = scheme == "loop"
     for _ in range(level):
-        cage = _split(cage, smooth, sharp_corners)
-    if level > 0 and smooth:
-        cage = cage._replace(vertices=_limit(cage, sharp_corners))
+        cage = _split_triangles(cage, sharp_corners) if is_loop else _split(cage, scheme != "bilinear", sharp_corners)
+    if level > 0 and scheme != "bilinear":
+        cage = cage._replace(vertices=_limit(cage, sharp_corners, is_loop))
     return cage
 
 
@@ -81,7 +83,6 @@ class _Topology(NamedTuple):
     of_corner: I64  #: (n_corners,) edge from each corner to the next
     lo: I64
     hi: I64
-    n_faces: I64  #: faces at each edge
     valence: I64  #: faces at each vertex
     edges: F64  #: sharpness of each edge
     corners: F64  #: sharpness of each vertex
@@ -99,7 +100,7 @@ def _analyse(cage: Cage, sharp_corners: bool) -> _Topology:
     edges[found[found >= 0]] = np.minimum(cage.creases.sharpness[found >= 0], INFINITE)
     corners[cage.creases.corners] = np.minimum(cage.creases.corner_sharpness, INFINITE)
     creases.mark_boundaries(lo, hi, n_faces, valence, sharp_corners, edges, corners)
-    return _Topology(starts, of_corner, lo, hi, n_faces, valence, edges, corners)
+    return _Topology(starts, of_corner, lo, hi, valence, edges, corners)
 
 
 def find_edges(lo: I64, hi: I64, wanted: I64) -> I64:
@@ -157,6 +158,24 @@ def _split(cage: Cage, smooth: bool, sharp_corners: bool) -> Cage:
     )
 
 
+def _split_triangles(cage: Cage, sharp_corners: bool) -> Cage:
+    t = _analyse(cage, sharp_corners)
+    n, n_faces = len(cage.vertices), len(cage.counts)
+    vertices = np.empty((n + len(t.lo), cage.vertices.shape[1]))
+    loop.split_vertices(cage.vertices, cage.indices, t.of_corner, t.lo, t.hi, t.edges, *_rules(cage, t), vertices)
+    triangles = np.empty((n_faces, 4, 3), np.int64)
+    corners = np.empty((n_faces, 4, 3, cage.corners.shape[1]))
+    loop.split_corners(cage.indices, t.of_corner, n, cage.corners, triangles, corners)
+    return Cage(
+        vertices,
+        np.full(4 * n_faces, 3, np.int64),
+        triangles.reshape(-1),
+        corners.reshape(12 * n_faces, -1),
+        np.repeat(cage.face, 4),
+        _after_step(cage, t),
+    )
+
+
 def _after_step(cage: Cage, t: _Topology) -> Creases:
     """What is still sharp after a step: both halves of an edge, and vertices."""
     sharp = cage.creases
@@ -170,12 +189,15 @@ def _after_step(cage: Cage, t: _Topology) -> Creases:
     return Creases(np.concatenate(halves), np.tile(left[kept], 2), sharp.corners[corners], left_of_corners[corners])
 
 
-def _limit(cage: Cage, sharp_corners: bool) -> F64:
-    """Where the vertices of an all-quad mesh end up after infinitely many steps."""
+def _limit(cage: Cage, sharp_corners: bool, is_loop: bool) -> F64:
+    """Where the vertices of an all-quad or all-triangle mesh end up after infinitely many steps."""
     t = _analyse(cage, sharp_corners)
     limit = np.empty_like(cage.vertices)
     weights, neighbours = _rules(cage, t)
-    meshing.limit_vertices(cage.vertices, cage.indices, t.lo, t.hi, t.valence, weights, neighbours, limit)
+    if is_loop:
+        loop.limit_vertices(cage.vertices, t.lo, t.hi, weights, neighbours, limit)
+    else:
+        meshing.limit_vertices(cage.vertices, cage.indices, t.lo, t.hi, t.valence, weights, neighbours, limit)
     fading = np.empty(len(limit), np.bool_)
     creases.find_fading(t.lo, t.hi, t.edges, t.corners, fading)
     rows = np.flatnonzero(fading & (t.valence > 0))
@@ -184,7 +206,16 @@ def _limit(cage: Cage, sharp_corners: bool) -> F64:
         own = own[np.argsort(cage.indices[own], kind="stable")]
         begin = np.searchsorted(cage.indices[own], np.append(rows, len(limit)))
         creases.limits_where_fading(
-            cage.vertices, cage.indices, t.of_corner, t.edges, t.corners, t.n_faces, rows, begin, own, limit
+            cage.vertices,
+            cage.indices,
+            t.of_corner,
+            t.edges,
+            t.corners,
+            rows,
+            begin,
+            own,
+            3 if is_loop else 4,
+            limit,
         )
     return limit
 

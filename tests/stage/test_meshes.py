@@ -358,5 +358,8 @@ def test_a_primvar_that_does_not_fit_falls_back_with_one_finding(name: str, faul
     assert np.allclose(triangles.normals, [0, 0, 1])
 
 
-def test_loop_subdivision_is_reported_once() -> None:
-    assert read_reporting(define(SQUARE, [[0, 1, 2], [0, 2, 3]], "loop"), 2)[1] == [("/mesh", "subdivisionScheme loop")]
+def test_loop_subdivision_of_other_faces_than_triangles_is_reported_once() -> None:
+    mesh, smooth = define(SQUARE, [[0, 1, 2, 3]], "loop"), define(SQUARE, [[0, 1, 2, 3]], "catmullClark")
+    triangles, findings = read_reporting(mesh, 2)
+    assert findings == [("/mesh", "subdivisionScheme loop")]
+    assert triangles is not None and np.array_equal(triangles.points, read(smooth, 2).points)

@@ -91,7 +91,7 @@ def test_mixed_polygons_become_quads_with_faces_and_corner_values_inherited() ->
     points = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0.5, 0), (0.5, 2, 0), (-1, 1, 0)])
     faces = [(0, 1, 2, 3), (1, 4, 2), (3, 2, 5, 6, 0)]
     flat = np.concatenate([points[list(face), :2] for face in faces])
-    refined = refine(cage(points, faces, flat), 1, smooth=False)
+    refined = refine(cage(points, faces, flat), 1, "bilinear")
     assert len(refined.counts) == 12 and set(refined.counts) == {4}
     assert np.array_equal(refined.face, np.repeat([0, 1, 2], [4, 3, 5]))
     # Linear corner values that equal the position keep equalling it.
