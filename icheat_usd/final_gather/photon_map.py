@@ -30,7 +30,8 @@ _SAME_PLANE = 0.9  # cosine between the normals of a place and of its photons
 _SAME_SIDE = 0.7  # cosine between the normals of a place and of the irradiance that stands for it
 _SITES_PER_ESTIMATE = 16  # irradiance is kept where that many photons share those that it is estimated from
 _PROBES = 16  # places where the kernel looks for its surface
-_LIFT = 0.02  # segments that tell what a place sees run so far above the surface, in radii of the kernel
+_LIFT = 0.001  # segments that tell what a place sees run so far above the surface, in radii of the kernel
+_ABOVE_PLANE = 0.49  # of the way of a probe, which crosses the plane at a half
 _LEAST_COVERAGE = 1.0 / _PROBES
 _LOPSIDED = 0.35  # radii from a place to the mean of its photons: four times what chance does to 80 of them
 
@@ -133,11 +134,11 @@ class PhotonMap:
             self.tree, position, normal, self._limit, _SAME_PLANE, _FLATNESS, index, distance, radius
         )
         seed = int(hash_combine(hash_combine(self.settings.seed, 0xB0), first))
-        coverage = self._coverage(position, normal, radius, index[:, 0] >= 0, seed)
+        coverage, clear = self._coverage(position, normal, radius, index[:, 0] >= 0, seed)
         # All of the kernel is seen nearly everywhere; elsewhere its photons must be seen as well.
         is_open = np.empty(n, np.bool_)
         kernels.lopsided(self.photons.position, position, index, radius, _LOPSIDED, is_open)
-        is_open = ~is_open & (coverage == 1)
+        is_open = ~is_open & clear
         visible = (index >= 0).astype(np.uint8)
         partly = np.flatnonzero(~is_open)
         row, column = np.nonzero(visible[partly])
@@ -150,25 +151,32 @@ class PhotonMap:
         kernels.sum_photons(self.photons.power, self.photons.light, index, distance, radius, visible, coverage, out)
         return _Estimates(out, radius, is_open)
 
-    def _coverage(self, position: F32, normal: F32, radius: F32, wanted: Bool, seed: int) -> F32:
-        """Share of each kernel that lies on the surface in sight, (n,)."""
-        coverage = np.ones(len(position), np.float32)
+    def _coverage(self, position: F32, normal: F32, radius: F32, wanted: Bool, seed: int) -> tuple[F32, Bool]:
+        """Share of each kernel that lies on the surface in sight, and whether nothing else is within it, (n,)."""
+        coverage, clear = np.ones(len(position), np.float32), np.ones(len(position), np.bool_)
         rows = np.flatnonzero(wanted)
         m = len(rows) * _PROBES
         if not m:
-            return coverage
+            return coverage, clear
         origin, direction = np.empty((m, 3), np.float32), np.empty((m, 3), np.float32)
         kernels.probe_rays(position[rows], normal[rows], radius[rows], _PROBES, _FLATNESS, seed, origin, direction)
-        hits = self.tracer.intersect(origin, direction, 1.0)
         owner = np.repeat(rows, _PROBES)
-        met = np.flatnonzero(hits.instance >= 0)
-        surface = shade_hits(self.snapshot, Hits._make(column[met] for column in hits), direction[met])
-        same = np.einsum("ij,ij->i", surface.normal, normal[owner[met]]) >= _SAME_PLANE
-        met = met[same]
         on = np.zeros(m, np.bool_)
-        on[met] = self._sees(position, normal, radius, owner[met], surface.position[same], surface.normal[same])
+        # Again from just above the plane where something lies in between: below a rug the floor goes on.
+        for begin in (0.0, _ABOVE_PLANE):
+            left = np.flatnonzero(~on)
+            start = origin[left] + np.float32(begin) * direction[left]
+            along = np.float32(1.0 - begin) * direction[left]
+            hits = self.tracer.intersect(start, along, 1.0)
+            met = np.flatnonzero(hits.instance >= 0)
+            surface = shade_hits(self.snapshot, Hits._make(column[met] for column in hits), along[met])
+            same = np.einsum("ij,ij->i", surface.normal, normal[owner[left[met]]]) >= _SAME_PLANE
+            met = left[met[same]]
+            on[met] = self._sees(position, normal, radius, owner[met], surface.position[same], surface.normal[same])
+            if begin == 0.0:
+                clear[rows] = on.reshape(-1, _PROBES).all(axis=1)
         coverage[rows] = on.reshape(-1, _PROBES).mean(axis=1, dtype=np.float32)
-        return coverage
+        return coverage, clear
 
     def _sees(
         self, position: F32, normal: F32, radius: F32, rows: NDArray[np.int64], target: F32, target_normal: F32
