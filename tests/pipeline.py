@@ -10,13 +10,16 @@ import numpy as np
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import EMPTY_STACK, Edit, EditStack, Selection
-from icheat_usd.final_gather import NO_EXTRAS, Extras, FinalGather, GatherSettings, final_gather
+from icheat_usd.final_gather import NO_EXTRAS, CacheSettings, Extras, FinalGather, GatherSettings, final_gather
 from icheat_usd.relight import Relighter, RelitView, build_relighter
 from icheat_usd.samples import GatherSamples, ViewSamples, gather_samples, view_samples
 from icheat_usd.samples.develop import develop
 from icheat_usd.scene import F64, SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import Bounces, CellLight, Transport, build_bounces, build_transport, light_cells
+
+#: Records of an image so small that two pixels are a tenth of it.
+TINY = CacheSettings(n_theta=16, least_reach=0.5)
 
 
 @dataclass
@@ -108,7 +111,7 @@ class Pipeline:
         extras: Extras = NO_EXTRAS,
     ) -> FinalGather:
         settings = GatherSettings(
-            samples, rays, light_samples, self.n_bounces, seed, method=method, edge_samples=edge_samples
+            samples, rays, light_samples, self.n_bounces, seed, method=method, edge_samples=edge_samples, cache=TINY
         )
         field = self.field(*edits)
         needs = method == "cached" or field.uses_incident or field.has_offset

@@ -131,4 +131,4 @@ def _brought(n: int, lobes: list[Lobe]) -> F32:
 
 
 #: Added to the numbers of camera samples, so that their rays are none of a record's.
-_ALONE = np.int64(1 << 40)
+_ALONE = np.int64(1 << 31)

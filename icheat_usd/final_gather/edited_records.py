@@ -79,26 +79,34 @@ class EditedRecords:
         every = np.zeros(self._cache.n, bool)
         for _, _, needed in missing:
             every |= needed
-        records = np.flatnonzero(every)
-        if len(records) == 0:
+        if not every.any():
             return
         cache = self._cache
-        rays = cache.rays
-        parts = [self._values]
         n = len(self._values.irradiance)
-        at_once = max(1, _RAYS_AT_ONCE // rays.n_rays)
-        for begin in range(0, len(records), at_once):
-            chunk = records[begin : begin + at_once]
-            pairs = RecordPairs(self._gatherer, take_rays(rays, chunk), take_points(cache.points, chunk))
+        total = 0
+        for _, slots, needed in missing:
+            count = int(needed.sum())
+            slots[needed] = n + total + np.arange(count, dtype=np.int32)
+            total += count
+        shape = (total, 3)
+        fresh = RecordValues(np.zeros(shape, np.float32), *(np.zeros((*shape, 3), np.float32) for _ in range(2)))
+        share = (1 / np.bincount(cache.owner, minlength=cache.n)).astype(np.float32)
+        hemispheres = np.flatnonzero(every[cache.owner])
+        at_once = max(1, _RAYS_AT_ONCE // cache.rays.n_rays)
+        for begin in range(0, len(hemispheres), at_once):
+            chunk = hemispheres[begin : begin + at_once]
+            owner = cache.owner[chunk]
+            pairs = RecordPairs(self._gatherer, take_rays(cache.rays, chunk), take_points(cache.points, chunk))
             for is_in, slots, needed in missing:
-                rows = np.flatnonzero(needed[chunk])
-                if len(rows) == 0:
-                    continue
-                values = pairs.values(rows, chunk[rows], is_in, cache)
-                slots[chunk[rows]] = n + np.arange(len(rows), dtype=np.int32)
-                n += len(rows)
-                parts.append(values)
-        self._values = RecordValues(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+                rows = np.flatnonzero(needed[owner])
+                if len(rows):
+                    found = pairs.values(rows, owner[rows], is_in, cache)
+                    weight = share[owner[rows]]
+                    for column, part in zip(fresh, found, strict=True):
+                        part *= weight.reshape(-1, *(1,) * (part.ndim - 1))
+                        # One hemisphere after another, whichever chunk it is in.
+                        np.add.at(column, slots[owner[rows]] - n, part)
+        self._values = RecordValues(*(np.concatenate(pair) for pair in zip(self._values, fresh, strict=True)))
 
 
 class RecordPairs:

@@ -251,7 +251,7 @@ def _band(
         samples_per_light(gatherer.snapshot, settings.light_samples, settings.dome_samples),
     )
     places = Places(view.points, _extent(gatherer.snapshot.camera, view))
-    light = find(places, view.to_eye, np.arange(view.n, dtype=np.int64), seed)
+    light = find(places, view.to_eye, view.stream.astype(np.int64) & 0x7FFFFFFF, seed)
     usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),

@@ -22,6 +22,7 @@ _COARSEST = 32  # pixels between the first places that are looked at
 _RAYS_AT_ONCE = 1 << 19
 _CREASE = 0.05  # pixels from the next surface, below which a record counts for little, so that better ones are made
 _LEAST_TRUST = 1e-3
+_NEXT_HEMISPHERE = 1 << 27  # between the numbers of random sequences, which count modulo 2^32
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,16 @@ class CacheSettings:
         A value makes no sense.
     """
 
-    n_theta: int = 16  #: rings of a record's hemisphere; 3 times as many sectors
+    n_theta: int = 12  #: rings of a hemisphere of rays; 3 times as many sectors
+    noise: float = 0.02  #: relative standard error of a record's irradiance, to which it gets more hemispheres
+    most_hemispheres: int = 8
     accuracy: float = 0.35  #: reach of a record, in harmonic mean distances of the surfaces around
-    least_reach: float = 1.0  #: pixels
+    clearance: float = 0.5  #: and no more of the distance of the nearest one
+    least_reach: float = 2.5  #: pixels
     most_reach: float = 24.0  #: pixels
     most_turn: float = 20.0  #: degrees between normals
     tolerance: float = 0.1  #: relative error of a record's own prediction at another, from which it ends before that
-    coverage: float = 0.3  #: sum of weights at a place, 1 at a record itself, from which it needs no record of its own
+    coverage: float = 0.5  #: sum of weights at a place, 1 at a record itself, from which it needs no record of its own
 
     def __post_init__(self) -> None:
         if self.n_theta < 4 or self.n_theta % 4:
@@ -100,6 +104,7 @@ class IrradianceCache:
     shrink: F32 = field(default_factory=lambda: np.empty(0, np.float32))  #: (n,) what `by_move` was multiplied with
     _points: list[SurfacePoints] = field(default_factory=list)
     _rays: list[RecordRays] = field(default_factory=list)
+    _owner: list[I64] = field(default_factory=list)
     _least: F32 = field(init=False)
     _index: kernels.RecordHash | None = None
 
@@ -117,7 +122,7 @@ class IrradianceCache:
 
     @property
     def rays(self) -> RecordRays:
-        """Rays of all records.
+        """Hemispheres of all records, one or more of each: see `owner`.
 
         Raises
         ------
@@ -131,8 +136,15 @@ class IrradianceCache:
         return self._rays[0]
 
     @property
+    def owner(self) -> I64:
+        """(n_hemispheres,) the record that each of `rays` belongs to."""
+        if len(self._owner) > 1:
+            self._owner = [np.concatenate(self._owner)]
+        return self._owner[0]
+
+    @property
     def points(self) -> SurfacePoints:
-        """Where the records are; kept as rays are."""
+        """(n_hemispheres,) where they stand."""
         if len(self._points) > 1:
             self._points = [concatenate_points(*self._points)]
         return self._points[0]
@@ -168,7 +180,7 @@ class IrradianceCache:
             np.empty((n, channels, 3), np.float32),
             np.empty((n, channels, 3), np.float32),
         )
-        spread = np.empty((n, 2), np.float32)
+        spread = np.empty((n, 3), np.float32)
         kernels.record_sums(
             radiance,
             rays.distance,
@@ -190,31 +202,59 @@ class IrradianceCache:
         for begin in range(0, len(places.extent), at_once):
             some = np.arange(begin, min(begin + at_once, len(places.extent)))
             points = take_points(places.points, some)
-            rays = self.tracer.trace(points, first + some)
-            found, spread = self.sums(rays, rays.radiance(self.cells))
+            found, spread = self._measure(points, first + some)
             tables.append(self._reaches(points, places.extent[some], found, spread))
             values.append(found)
-            if self.is_kept:
-                self._rays.append(rays)
-                self._points.append(points)
         self._judge(places, RecordValues(*(np.concatenate(column) for column in zip(*values, strict=True))))
         parts = [self.table, *(table for table, _ in tables)]
         self.table = kernels.RecordTable(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         self._least = np.concatenate([self._least, *(least for _, least in tables)])
-        clamped = np.empty(self.n - first, np.float32)
+        clamped = np.empty(self.n, np.float32)
         kernels.clamp_to_neighbours(self.table.position, self.table.reach, first, clamped)
-        self.table.reach[first:] = np.maximum(clamped, self._least[first:])
+        np.maximum(clamped, self._least, out=self.table.reach)
         self.values = RecordValues(
             *(np.concatenate([old, *new]) for old, new in zip(self.values, zip(*values, strict=True), strict=True))
         )
         self._index = None
+
+    def _measure(self, points: SurfacePoints, record: I64) -> tuple[RecordValues, F32]:
+        """Values of new records and the spread of their distances, from as many hemispheres as their noise asks for."""
+        settings = self.settings
+        rays = self.tracer.trace(points, record)
+        values, spread = self.sums(rays, rays.radiance(self.cells))
+        self._keep(rays, points, record)
+        wanted = np.ceil((spread[:, 2].astype(np.float64) / settings.noise) ** 2)
+        number = np.clip(wanted, 1, settings.most_hemispheres).astype(np.int64)
+        closeness = 1 / spread[:, 0].astype(np.float64)
+        for further in range(1, int(number.max(initial=1))):
+            rows = np.flatnonzero(number > further)
+            some = take_points(points, rows)
+            rays = self.tracer.trace(some, record[rows] + further * _NEXT_HEMISPHERE)
+            more, other = self.sums(rays, rays.radiance(self.cells))
+            for column, new in zip(values, more, strict=True):
+                column[rows] += new
+            closeness[rows] += 1 / other[:, 0].astype(np.float64)
+            spread[rows, 1] = np.minimum(spread[rows, 1], other[:, 1])
+            self._keep(rays, some, record[rows])
+        share = (1 / number).astype(np.float32)
+        for column in values:
+            column *= share.reshape(-1, *(1,) * (column.ndim - 1))
+        with np.errstate(divide="ignore"):
+            spread[:, 0] = number / closeness
+        return values, spread
+
+    def _keep(self, rays: RecordRays, points: SurfacePoints, record: I64) -> None:
+        if self.is_kept:
+            self._rays.append(rays)
+            self._points.append(points)
+            self._owner.append(record)
 
     def _reaches(
         self, points: SurfacePoints, extent: F32, values: RecordValues, spread: F32
     ) -> tuple[kernels.RecordTable, F32]:
         settings = self.settings
         least = settings.least_reach * extent
-        reach = np.minimum(settings.accuracy * spread[:, 0], spread[:, 1])
+        reach = np.minimum(settings.accuracy * spread[:, 0], settings.clearance * spread[:, 1])
         # Where light changes faster than surfaces tell.
         change = np.sqrt((values.by_move.astype(np.float64) ** 2).sum(axis=(1, 2)))
         size = np.sqrt((values.irradiance.astype(np.float64) ** 2).sum(axis=1))

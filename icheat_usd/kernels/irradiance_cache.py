@@ -62,8 +62,9 @@ def record_sums(  # type: ignore[no-untyped-def]
     irradiance : (n, C) float32, out
     by_turn, by_move : (n, C, 3) float32, out
         Change with ``normal x other normal``, and with place, metres, both in world space.
-    spread : (n, 2) float32, out
+    spread : (n, 3) float32, out
         Harmonic mean of the distances, and the least of them but for grazing rays; metres, inf if there is nothing.
+        Relative standard error of the irradiance, as neighbouring rays differ: too large where light varies smoothly.
     """
     for r in prange(len(stream)):
         _sums_of_record(
@@ -104,6 +105,7 @@ def _sums_of_record(  # type: ignore[no-untyped-def]
         slope[j] = np.sqrt(u / (1.0 - u))
         low[j] = (1.0 - j / m) * np.sqrt(j / m) * (2.0 * np.pi / n)
         width[j] = np.sqrt((j + 1) / m) - np.sqrt(j / m)
+    unlike = 0.0
     total, turn, move = np.zeros(n_channels), np.zeros((n_channels, 2)), np.zeros((n_channels, 2))
     for k in range(n):
         phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
@@ -116,8 +118,10 @@ def _sums_of_record(  # type: ignore[no-untyped-def]
             d = distance[r, ray]
             outwards = low[j] / max(min(d, distance[r, inside]), _TOUCHING)
             around = width[j] / max(min(d, distance[r, beside]), _TOUCHING)
+            step = 0.0
             for c in range(n_channels):
                 value = np.float64(radiance[r, ray, c])
+                step += value - radiance[r, beside, c]
                 total[c] += value
                 turn[c, 0] -= along * slope[j] * value
                 turn[c, 1] += across * slope[j] * value
@@ -125,6 +129,11 @@ def _sums_of_record(  # type: ignore[no-untyped-def]
                 turned = around * (value - radiance[r, beside, c])
                 move[c, 0] += across * out - edge_along * turned
                 move[c, 1] += along * out + edge_across * turned
+            unlike += step * step
+    light = 0.0
+    for c in range(n_channels):
+        light += total[c]
+    spread[r, 2] = np.sqrt(0.5 * unlike) / light if light > 0.0 else 0.0
     share = np.pi / (m * n)
     for c in range(n_channels):
         irradiance[r, c] = share * total[c]
@@ -139,13 +148,14 @@ def _sums_of_record(  # type: ignore[no-untyped-def]
 
 @parallel_kernel
 def clamp_to_neighbours(position, reach, first, out):  # type: ignore[no-untyped-def]
-    """Reach of records from `first` on, no more than that of any other and the distance to it (Krivanek 2006, 4.2).
+    """Reach of records, no more than that of any other and the distance to it (Krivanek 2006, 4.2).
 
-    `out` is (n - first,) float32. What is near one record is near another beside it.
+    What is near one record is near another beside it. Records before `first`
+    were compared with each other already. `out` is (n,) float32.
     """
-    for i in prange(first, len(reach)):
+    for i in prange(len(reach)):
         least = reach[i]
-        for j in range(len(reach)):
+        for j in range(0 if i >= first else first, len(reach)):
             if reach[j] < least:
                 x = position[j, 0] - position[i, 0]
                 y = position[j, 1] - position[i, 1]
@@ -154,7 +164,7 @@ def clamp_to_neighbours(position, reach, first, out):  # type: ignore[no-untyped
                 left = least - reach[j]
                 if d2 < left * left:
                     least = reach[j] + np.float32(np.sqrt(d2))
-        out[i - first] = least
+        out[i] = least
 
 
 @kernel
@@ -232,7 +242,7 @@ def _weight(position, normal, reach, turn, trust, r, x, y, z, nx, ny, nz):  # ty
     if error >= np.float32(1.0):
         return np.float32(0.0)
     left = np.float32(1.0) - error
-    return trust[r] * left * left
+    return trust[r] * left
 
 
 @parallel_kernel

@@ -301,7 +301,7 @@ def _spread(snapshot: SceneSnapshot, area: F64, slots: _Slots, count: I64, seed:
     side = np.array(sides, np.int64)
     begin = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     # By side, so that a surface's samples stay where they are when another surface comes or goes.
-    slot_seed = (side * 0x2545F491 + seed * 0x9E3779B1 + stream * 0x85EBCA6B) & 0xFFFFFFFF
+    slot_seed = (side * 0x2545F491 + ((seed * 0x9E3779B1 + stream * 0x85EBCA6B) & 0xFFFFFFFF)) & 0xFFFFFFFF
     triangle = np.empty(begin[-1], np.int32)
     uv = np.empty((begin[-1], 2), np.float32)
     geometry = snapshot.geometry
