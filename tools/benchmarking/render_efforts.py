@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from icheat_usd.final_gather import GatherSettings
+from icheat_usd.final_gather import CacheSettings, GatherSettings
 from icheat_usd.session.quality import PREVIEW, Quality
 
 
@@ -16,16 +16,38 @@ class RenderEffort(NamedTuple):
     quality: Quality  #: of the gather samples that earlier bounces are taken from
 
 
+def _cached(n_gather: int, bounce_rays: int, light_samples: int, settings: GatherSettings) -> RenderEffort:
+    quality = replace(PREVIEW, n_gather=n_gather, rays_per_bounce_row=bounce_rays, light_samples=light_samples)
+    return RenderEffort(settings, quality)
+
+
 #: By name; every one is rendered by itself and gives one point of a curve.
 EFFORTS: dict[str, RenderEffort] = {
-    "brute 1 x 4": RenderEffort(GatherSettings(method="brute", samples_per_pixel=1, gather_rays=4), PREVIEW),
     "brute 4 x 16": RenderEffort(GatherSettings(method="brute", samples_per_pixel=4, gather_rays=16), PREVIEW),
-    "cached 1": RenderEffort(GatherSettings(samples_per_pixel=1), PREVIEW),
-    "cached 4": RenderEffort(GatherSettings(samples_per_pixel=4), PREVIEW),
+    "cached 1": _cached(
+        8_192, 64, 2, GatherSettings(1, light_samples=1, edge_samples=8, cache=CacheSettings(noise=0.05))
+    ),
+    "cached 2": _cached(
+        32_768, 64, 4, GatherSettings(1, light_samples=2, edge_samples=12, cache=CacheSettings(noise=0.03))
+    ),
+    "cached 3": _cached(
+        65_536, 128, 8, GatherSettings(2, light_samples=2, edge_samples=16, cache=CacheSettings(noise=0.015))
+    ),
+    "cached 4": _cached(
+        131_072,
+        256,
+        8,
+        GatherSettings(
+            4,
+            light_samples=2,
+            edge_samples=24,
+            cache=CacheSettings(n_theta=16, noise=0.008, most_hemispheres=16, least_reach=1.5),
+        ),
+    ),
 }
 
 #: What is measured where one effort must do: cost of edits, growth.
-USUAL = "cached 4"
+USUAL = "cached 3"
 
 _LEAST = replace(PREVIEW, n_gather=512, rays_per_bounce_row=16, light_samples=2)
 
