@@ -35,10 +35,14 @@ class CachedGather:
         With rays, if the stack has edits.
     glossy_rays : int
         Per point with a specular lobe.
+    is_kept : bool
+        Whether to keep `samples`, what was found at every call of `light`, for other stacks.
     """
 
-    def __init__(self, gatherer: Gatherer, cache: IrradianceCache, glossy_rays: int) -> None:
-        self._gatherer, self._cache, self._glossy_rays = gatherer, cache, glossy_rays
+    def __init__(self, gatherer: Gatherer, cache: IrradianceCache, glossy_rays: int, *, is_kept: bool = False) -> None:
+        self._gatherer, self.cache, self._glossy_rays = gatherer, cache, glossy_rays
+        self._is_kept = is_kept
+        self.samples: list[Sampled] = []
         stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
         self._stacks = [(stack, EditedRecords(stack, cache)) for stack in stacks]
 
@@ -46,25 +50,27 @@ class CachedGather:
         """Radiance towards the eye; points that no edit touches have the same bits in both results."""
         points = places.points
         position, normal = points.position, points.shading_normal
-        found = self._cache.find(position, normal)
-        irradiance = np.maximum(self._cache.interpolate(found, position, normal), np.float32(0))
+        found = self.cache.find(position, normal)
+        irradiance = np.maximum(self.cache.interpolate(found, position, normal), np.float32(0))
         # What the coarser look at the scene has missed, less than a pixel wide, is gathered where it is.
         alone, own_rays = np.flatnonzero(found.number == 0), None
         if len(alone):
-            own_rays = self._cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone])
-            irradiance[alone] = np.pi * own_rays.radiance(self._cache.cells).mean(axis=1)
+            own_rays = self.cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone])
+            irradiance[alone] = np.pi * own_rays.radiance(self.cache.cells).mean(axis=1)
         base = (points.albedo * (irradiance * _INVERSE_PI)).astype(np.float32, copy=False)
         shiny = specular_lobe(self._gatherer, points, to_eye, stream, self._glossy_rays, seed)
         if shiny is not None:
             base[shiny.where] += shiny.mean()
+        sample = Sampled(points, stream, seed, found, base, shiny, alone, own_rays)
+        if self._is_kept:
+            self.samples.append(sample)
         if not self._stacks:
             return GatheredLight(base, base.copy())
-        sample = _Sampled(points, stream, seed, found, base, shiny, alone, own_rays)
-        *steps, edited = (_under_stack(stack, records, sample) for stack, records in self._stacks)
+        *steps, edited = (under_stack(stack, records, sample) for stack, records in self._stacks)
         return GatheredLight(base, edited, tuple(steps))
 
 
-class _Sampled(NamedTuple):
+class Sampled(NamedTuple):
     """Camera samples and their light before any edit."""
 
     points: SurfacePoints
@@ -77,7 +83,8 @@ class _Sampled(NamedTuple):
     own_rays: RecordRays | None  #: of these
 
 
-def _under_stack(g: Gatherer, records: EditedRecords, sampled: _Sampled) -> F32:
+def under_stack(g: Gatherer, records: EditedRecords, sampled: Sampled) -> F32:
+    """Light of camera samples under the stack of a gatherer, (n, 3); where no edit acts the bits of `base`."""
     points, base, shiny = sampled.points, sampled.base, sampled.shiny
     edited = base.copy()
     receivers, touched = touched_receivers(g.field, points)

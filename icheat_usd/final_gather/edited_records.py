@@ -14,6 +14,7 @@ import numpy as np
 from icheat_usd.edits.bound import Ends
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.operations import PairEnd
+from icheat_usd.final_gather.caster_light import CasterLight, is_of_objects
 from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, RecordValues
 from icheat_usd.final_gather.record_rays import RecordRays, take_rays
@@ -33,10 +34,15 @@ class EditedRecords:
     ----------
     cache : IrradianceCache
         Its rays are kept.
+    by_caster : CasterLight, optional
+        Of another stack that tells the same groups of lights apart, if both stacks are `is_of_objects`.
     """
 
-    def __init__(self, gatherer: Gatherer, cache: IrradianceCache) -> None:
+    def __init__(self, gatherer: Gatherer, cache: IrradianceCache, by_caster: CasterLight | None = None) -> None:
         self._gatherer, self._cache = gatherer, cache
+        self.by_caster = by_caster
+        if by_caster is None and gatherer.solution is not None and is_of_objects(gatherer.field):
+            self.by_caster = CasterLight(cache, gatherer.solution.b)
         self._slots: dict[bytes, np.ndarray] = {}
         self._values = RecordValues(
             np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty((0, 3, 3), np.float32)
@@ -88,6 +94,11 @@ class EditedRecords:
             count = int(needed.sum())
             slots[needed] = n + total + np.arange(count, dtype=np.int32)
             total += count
+        if self.by_caster is not None:
+            field = self._gatherer.field
+            parts = [self.by_caster.change(field, is_in, needed) for is_in, _, needed in missing]
+            self._values = RecordValues(*(np.concatenate(c) for c in zip(self._values, *parts, strict=True)))
+            return
         shape = (total, 3)
         fresh = RecordValues(np.zeros(shape, np.float32), *(np.zeros((*shape, 3), np.float32) for _ in range(2)))
         share = (1 / np.bincount(cache.owner, minlength=cache.n)).astype(np.float32)

@@ -36,6 +36,7 @@ from icheat_usd.final_gather.gatherer import GatheredLight, Gatherer, GatherSolu
 from icheat_usd.final_gather.hits import trace_hemisphere
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Places, overture
 from icheat_usd.final_gather.record_rays import HemisphereTracer
+from icheat_usd.final_gather.replay import KeptBand, Replay
 from icheat_usd.final_gather.settings import GatherSettings
 from icheat_usd.image.cryptomatte import Coverage, weighted_sum
 from icheat_usd.kernels.random import hash_combine
@@ -79,6 +80,7 @@ class FinalGather:
     #: direct light of groups of lights, by name; if asked for
     coverage: Mapping[str, Coverage] = field(default_factory=lambda: MappingProxyType({}))
     #: which prims ("object") and edits ("edit") the pixels show; if asked for
+    replay: Replay | None = None  #: the same frame under other edits; if asked for, and only by the cached method
 
 
 class _Band(NamedTuple):
@@ -99,6 +101,7 @@ def final_gather(
     gather: GatherSamples | None = None,
     gather_radiance: F32 | None = None,
     extras: Extras = NO_EXTRAS,
+    is_kept: bool = False,
     progress: Progress = silent,
 ) -> FinalGather:
     """Render direct and indirect light, the latter with and without edits.
@@ -118,6 +121,9 @@ def final_gather(
         integrated over area.
     extras : Extras
         What to compute beside the usual layers.
+    is_kept : bool
+        Whether the image comes with a `Replay`: 10 kB of memory for each hemisphere of rays, 0.5 kB for each camera
+        sample, and 4 kB more for a glossy one.
 
     Raises
     ------
@@ -150,13 +156,19 @@ def final_gather(
     # Errors of images that are parts of one are to cancel.
     seed = settings.seed if settings.first_sample is None else int(hash_combine(settings.seed, settings.first_sample))
     find: FindLight = partial(_followed, gatherer)
-    if is_cached and gather is not None:
-        find = _cached(gatherer, gather, camera, settings, seed, progress).light
     bands: list[_Band] = []
+    kept: list[KeptBand] = []
+    replay = None
+    if is_cached and gather is not None and gather_radiance is not None:
+        cached = _cached(gatherer, gather, camera, settings, seed, is_kept, progress)
+        find = cached.light
+        replay = Replay(gatherer, cached, kept, gather_radiance) if is_kept else None
     for number, (pixels, view) in enumerate(camera.all()):
         progress("gather", number / len(camera.bands))
         own_seed = int(hash_combine(seed, pixels[0]))
         bands.append(_band(gatherer, find, view, settings, pixels, own_seed, extras))
+        if replay is not None:
+            kept.append(KeptBand(pixels, view))
     progress("gather", 1.0)
     shape = (snapshot.camera.height, snapshot.camera.width, -1)
 
@@ -169,6 +181,7 @@ def final_gather(
         contributions=whole([part.contributions for part in bands]),
         light_groups=whole([part.light_groups for part in bands]),
         coverage={name: weighted_sum((1.0, part[name]) for part in mattes) for name in mattes[0]},
+        replay=replay,
     )
 
 
@@ -178,6 +191,7 @@ def _cached(
     camera: CameraPass,
     settings: GatherSettings,
     seed: int,
+    is_kept: bool,
     progress: Progress,
 ) -> CachedGather:
     """Place all records, by the camera samples that every pixel has."""
@@ -186,13 +200,13 @@ def _cached(
     cells = np.concatenate([gatherer.solution.total, np.zeros((1, 3), np.float32)])
     n_theta, n_phi, own_seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(seed, 0xCAC4E))
     tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed)
-    cache = IrradianceCache(tracer, cells, settings.cache, is_kept=not gatherer.field.is_identity)
+    cache = IrradianceCache(tracer, cells, settings.cache, is_kept=is_kept or not gatherer.field.is_identity)
     views = [band.view for band in camera.first()]
     points = concatenate_points(*(view.points for view in views))
     pixel = np.concatenate([view.pixel for view in views])
     extent = np.concatenate([_extent(snapshot.camera, view) for view in views])
     overture(cache, Places(points, extent), pixel, snapshot.camera.width, progress)
-    return CachedGather(gatherer, cache, settings.glossy_rays)
+    return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept)
 
 
 def _extent(camera: Camera, view: ViewSamples) -> F32:

@@ -48,9 +48,16 @@ def weighted_gather(moments: Iterable[tuple[float, FinalGather]]) -> FinalGather
         raise ValueError("there is no moment to show")
     shown = {name: values / np.where(seen > 0, seen, 1.0) for name, values in surface.items()}
     mattes = {name: weighted_sum(parts) for name, parts in coverage.items()}
+    layers = {**light, **shown}
     return FinalGather(
-        **light,
-        **shown,
+        background=layers["background"],
+        emission=layers["emission"],
+        direct=layers["direct"],
+        indirect=layers["indirect"],
+        indirect_edited=layers["indirect_edited"],
+        albedo=layers["albedo"],
+        normal=layers["normal"],
+        depth=layers["depth"],
         contributions=groups["contributions"],
         light_groups=groups["light_groups"],
         coverage=mattes,

@@ -397,3 +397,118 @@ def differences(  # type: ignore[no-untyped-def]
                 wrong += abs(value - irradiance[i, c])
                 true += irradiance[i, c]
             out[q, k] = wrong / max(true, np.float32(floor))
+
+
+@parallel_kernel
+def list_casters(instance, local, number, listed):  # type: ignore[no-untyped-def]
+    """Different casters of each row of rays.
+
+    Parameters
+    ----------
+    instance : (n, n_rays) int32
+        Of the surface that sends each ray its light, -1 for none.
+    local : (n, n_rays) int16, out
+        Place of it in the row's list, -1 for none.
+    number : (n,) int32, listed : (n, n_rays) int32, out
+    """
+    for r in prange(instance.shape[0]):
+        _list_row(r, instance, local, number, listed)
+
+
+@kernel
+def _list_row(r, instance, local, number, listed):  # type: ignore[no-untyped-def]
+    n = 0
+    last = 0
+    for ray in range(instance.shape[1]):
+        i = instance[r, ray]
+        local[r, ray] = -1
+        if i < 0:
+            continue
+        if n == 0 or listed[r, last] != i:
+            last = 0
+            while last < n and listed[r, last] != i:
+                last += 1
+            if last == n:
+                listed[r, n] = i
+                n += 1
+        local[r, ray] = last
+    number[r] = n
+
+
+@parallel_kernel
+def caster_sums(  # type: ignore[no-untyped-def]
+    radiance, distance, local, begin, shading_normal, stream, seed, n_theta, n_phi, irradiance, by_turn, by_move
+):
+    """`record_sums` of the light of each caster alone.
+
+    Parameters
+    ----------
+    radiance : (n, n_rays, C) float32
+    local : (n, n_rays) int16, as of `list_casters`
+    begin : (n,) int64
+        Row of the first caster of each hemisphere in the outputs, which are zero before.
+    irradiance : (m, C), by_turn, by_move : (m, C, 3) float32, out
+    """
+    for r in prange(len(stream)):
+        _caster_sums_of_row(
+            r,
+            radiance,
+            distance,
+            local,
+            begin[r],
+            shading_normal,
+            turn_of(hash_combine(seed, stream[r])),
+            n_theta,
+            n_phi,
+            irradiance,
+            by_turn,
+            by_move,
+        )
+
+
+@kernel
+def _caster_sums_of_row(  # type: ignore[no-untyped-def]
+    r, radiance, distance, local, begin, shading_normal, first_turn, n_theta, n_phi, irradiance, by_turn, by_move
+):
+    tx, ty, tz, bx, by, bz = basis(shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2])
+    m, n = n_theta, n_phi
+    n_channels = radiance.shape[2]
+    share = np.pi / (m * n)
+    slope, low, width = np.empty(m), np.empty(m), np.empty(m)
+    for j in range(m):
+        u = (j + 0.5) / m
+        slope[j] = share * np.sqrt(u / (1.0 - u))
+        low[j] = (1.0 - j / m) * np.sqrt(j / m) * (2.0 * np.pi / n)
+        width[j] = np.sqrt((j + 1) / m) - np.sqrt(j / m)
+    for k in range(n):
+        phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
+        edge = 2.0 * np.pi * (k / n + first_turn)
+        next_edge = 2.0 * np.pi * ((k + 1) / n + first_turn)
+        across, along = np.cos(phi), np.sin(phi)
+        before, after = (k - 1 if k > 0 else n - 1), (k + 1 if k + 1 < n else 0)
+        for j in range(m):
+            ray = j * n + k
+            if local[r, ray] < 0:
+                continue
+            # A ray counts in the differences to the four beside it, with one sign or the other.
+            d = distance[r, ray]
+            out = 0.0
+            if j > 0:
+                out += low[j] / max(min(d, distance[r, ray - n]), _TOUCHING)
+            if j + 1 < m:
+                out -= low[j + 1] / max(min(d, distance[r, ray + n]), _TOUCHING)
+            here = width[j] / max(min(d, distance[r, j * n + before]), _TOUCHING)
+            there = width[j] / max(min(d, distance[r, j * n + after]), _TOUCHING)
+            a = across * out - np.sin(edge) * here + np.sin(next_edge) * there
+            b = along * out + np.cos(edge) * here - np.cos(next_edge) * there
+            ga, gb = -along * slope[j], across * slope[j]
+            row = begin + local[r, ray]
+            for c in range(n_channels):
+                value = np.float64(radiance[r, ray, c])
+                irradiance[row, c] += share * value
+                by_turn[row, c, 0] += value * (ga * tx + gb * bx)
+                by_turn[row, c, 1] += value * (ga * ty + gb * by)
+                by_turn[row, c, 2] += value * (ga * tz + gb * bz)
+                by_move[row, c, 0] += value * (a * tx + b * bx)
+                by_move[row, c, 1] += value * (a * ty + b * by)
+                by_move[row, c, 2] += value * (a * tz + b * bz)

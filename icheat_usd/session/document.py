@@ -21,6 +21,7 @@ from icheat_usd.session import authoring, films, keys, layer_names
 from icheat_usd.session.disk_cache import DiskCache
 from icheat_usd.session.quality import FINAL, PREVIEW, Quality
 from icheat_usd.session.rendering import render_film
+from icheat_usd.session.replaying import FrameReplay
 from icheat_usd.session.shot_parts import Memory, ShotParts
 from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
@@ -213,6 +214,10 @@ class Session(ShotParts):
         return render_film(
             self, settings, [layer_names.Layer(source, layer_names.layer_name(source)) for source in sources]
         )
+
+    def replay(self, settings: GatherSettings = FINAL, layers: Sequence[str] = layer_names.DEFAULT) -> FrameReplay:
+        """Render a final frame and keep what its rays brought, to make it again whenever edits have changed."""
+        return FrameReplay(self, settings, layers)
 
     def metadata(self, renderer: str, stack: EditStack, settings: Mapping[str, Any]) -> dict[str, str]:
         """What made an image, for its file."""

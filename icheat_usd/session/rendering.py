@@ -77,7 +77,7 @@ def render_film(session: Session, settings: GatherSettings, layers: Sequence[lay
     if settings.denoise:
         extras = with_denoising(extras)
     result = weighted_gather(
-        (weight, _gather(moment, effort, extras)) for weight, moment, effort in _moments(session, settings)
+        (weight, gather_frame(moment, effort, extras)) for weight, moment, effort in _moments(session, settings)
     )
     if settings.denoise:
         result = denoised(result, [edit.path for edit in stack.active], progress=session.progress)
@@ -132,7 +132,8 @@ def _moments(session: Session, settings: GatherSettings) -> Iterator[tuple[float
         yield moment.weight, moment.session, effort
 
 
-def _gather(session: Session, settings: GatherSettings, extras: Extras) -> FinalGather:
+def gather_frame(session: Session, settings: GatherSettings, extras: Extras, *, is_kept: bool = False) -> FinalGather:
+    """The frame at one moment."""
     field = bind(session.stack, session.snapshot)
     gather, radiance = None, None
     if settings.method == "cached" or field.uses_incident or field.has_offset:
@@ -146,6 +147,7 @@ def _gather(session: Session, settings: GatherSettings, extras: Extras) -> Final
         gather=gather,
         gather_radiance=radiance,
         extras=extras,
+        is_kept=is_kept,
         progress=session.progress,
     )
 

@@ -1,0 +1,90 @@
+"""Frames made again with other edits: the bits of a render, and which light belongs to which caster."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from icheat_usd.edits.model import Edit
+from icheat_usd.final_gather import GatherSettings, final_gather
+from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, WHITE, painted, previews
+from tests.pipeline import TINY, select
+
+SETTINGS = GatherSettings(4, 16, 4, 4, edge_samples=2, cache=TINY)
+STACKS = {
+    "nothing": (),
+    "objects": (BLEED,),
+    "other amount": (Edit("/bleed", "scale", {"color": (3.0, 2.0, 0.5)}, BLEED.receivers, BLEED.casters, amount=0.3),),
+    "overlapping": (BLEED, DIM),
+    "added light": (Edit("/emit", "emit", {"color": (0.2, 0.1, 0.3)}, select("/floor"), select("/tall")), BLEED),
+    "hue": (GREY,),
+    "soft masks": (painted("scale", {"gain": 4.0}), DIM),
+    "direction": (Edit("/e", "falloff", {"exponent": 1.0}, WHITE, EVERYTHING),),
+    "curve": (Edit("/g", "gamma", {"exponent": 0.7}, select("/floor"), EVERYTHING),),
+}
+
+
+def rendered(*edits: Edit, is_kept: bool = False):
+    parts = previews()[0]
+    return final_gather(
+        parts.snapshot,
+        parts.tracer,
+        parts.field(*edits),
+        settings=SETTINGS,
+        gather=parts.gather,
+        gather_radiance=parts.cell_light.radiance,
+        is_kept=is_kept,
+    )
+
+
+@pytest.mark.parametrize("first", ["nothing", "overlapping"])
+def test_a_replay_has_the_bits_of_a_render(first):
+    kept = rendered(*STACKS[first], is_kept=True)
+    changed = 0
+    for stack in STACKS.values():
+        replayed = kept.replay.edited(previews()[0].field(*stack))
+        again = rendered(*stack)
+        np.testing.assert_array_equal(again.indirect, kept.indirect)
+        np.testing.assert_array_equal(replayed, again.indirect_edited)
+        changed += bool((replayed != kept.indirect).any())
+    assert changed == len(STACKS) - 1
+
+
+def test_a_render_that_is_not_kept_has_no_replay():
+    assert rendered(BLEED).replay is None
+
+
+@pytest.mark.parametrize("name", ["objects", "overlapping", "added light"])
+def test_light_by_caster_is_the_light_of_the_rays(name, monkeypatch):
+    """Summed for each caster first, and edited ray by ray."""
+    fast = rendered(*STACKS[name]).indirect_edited
+    monkeypatch.setattr("icheat_usd.final_gather.edited_records.is_of_objects", lambda field: False)
+    slow = rendered(*STACKS[name]).indirect_edited
+    assert (fast != slow).any()
+    np.testing.assert_allclose(fast, slow, rtol=2e-4, atol=1e-6)
+
+
+def test_a_replay_has_the_same_bits_on_one_thread_and_on_two():
+    found = []
+    for threads in (1, 2):
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        try:
+            kept = rendered(is_kept=True)
+            found.append(kept.replay.edited(previews()[0].field(BLEED, DIM)))
+        finally:
+            numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    np.testing.assert_array_equal(*found)
+
+
+def test_no_ray_is_traced_for_edits_of_objects_masks_and_colours(monkeypatch):
+    parts = previews()[0]
+    kept = rendered(is_kept=True)
+
+    def refuse(*_, **__):
+        raise AssertionError("a ray was traced")
+
+    monkeypatch.setattr(type(parts.tracer), "intersect", refuse)
+    monkeypatch.setattr(type(parts.tracer), "compiled", refuse)
+    for name in ("objects", "overlapping", "added light", "hue", "soft masks", "direction"):
+        assert (kept.replay.edited(parts.field(*STACKS[name])) != kept.indirect).any()
