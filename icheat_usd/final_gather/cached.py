@@ -50,7 +50,7 @@ class CachedGather:
         """Radiance towards the eye; points that no edit touches have the same bits in both results."""
         points = places.points
         position, normal = points.position, points.shading_normal
-        found = self.cache.find(position, normal)
+        found = self.cache.find(places)
         irradiance = np.maximum(self.cache.interpolate(found, position, normal), np.float32(0))
         # What the coarser look at the scene has missed, less than a pixel wide, is gathered where it is.
         alone, own_rays = np.flatnonzero(found.number == 0), None

@@ -34,7 +34,8 @@ from icheat_usd.final_gather.extras import (
 )
 from icheat_usd.final_gather.gatherer import GatheredLight, Gatherer, GatherSolution, gathered_light
 from icheat_usd.final_gather.hits import trace_hemisphere
-from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Places, overture
+from icheat_usd.final_gather.irradiance_cache import IrradianceCache, join_places, overture
+from icheat_usd.final_gather.places import places_of
 from icheat_usd.final_gather.record_rays import HemisphereTracer
 from icheat_usd.final_gather.replay import KeptBand, Replay
 from icheat_usd.final_gather.settings import GatherSettings
@@ -45,7 +46,7 @@ from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
 from icheat_usd.samples.develop import average, develop
-from icheat_usd.scene import F32, F64, I64, Camera, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import sum_groups
 
@@ -55,8 +56,8 @@ RAYS_AT_ONCE = 1 << 19
 #: Camera samples that are shaded together, where light is cached.
 SAMPLES_AT_ONCE = 1 << 17
 
-#: What the indirect light of camera samples is found by: their places, directions to the eye, numbers, and a seed.
-FindLight = Callable[[Places, F32, I64, int], GatheredLight]
+#: What the indirect light of camera samples is found by, from their random counters and a seed.
+FindLight = Callable[[ViewSamples, I64, int], GatheredLight]
 
 #: Where pilot points are taken from in the picture, at most.
 PILOT_ROWS, PILOT_COLUMNS = 24, 128
@@ -161,7 +162,7 @@ def final_gather(
     replay = None
     if is_cached and gather is not None and gather_radiance is not None:
         cached = _cached(gatherer, gather, camera, settings, seed, is_kept, progress)
-        find = cached.light
+        find = partial(_interpolated, gatherer, cached)
         replay = Replay(gatherer, cached, kept, gather_radiance) if is_kept else None
     for number, (pixels, view) in enumerate(camera.all()):
         progress("gather", number / len(camera.bands))
@@ -201,22 +202,20 @@ def _cached(
     n_theta, n_phi, own_seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(seed, 0xCAC4E))
     tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed)
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=is_kept or not gatherer.field.is_identity)
-    views = [band.view for band in camera.first()]
-    points = concatenate_points(*(view.points for view in views))
-    pixel = np.concatenate([view.pixel for view in views])
-    extent = np.concatenate([_extent(snapshot.camera, view) for view in views])
-    overture(cache, Places(points, extent), pixel, snapshot.camera.width, progress)
+    found, pixel = [], []
+    for _, view in camera.first():
+        found.append(places_of(snapshot, gatherer.tracer, view, seed))
+        pixel.append(view.pixel)
+    overture(cache, join_places(found), np.concatenate(pixel), snapshot.camera.width, progress)
     return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept)
 
 
-def _extent(camera: Camera, view: ViewSamples) -> F32:
-    """(n,) metres that a pixel spans at each view sample, across the line of sight."""
-    width = np.float32((camera.window[1] - camera.window[0]) / camera.width)
-    return np.full(view.n, width, np.float32) if camera.orthographic else view.depth * width
+def _followed(gatherer: Gatherer, view: ViewSamples, stream: I64, seed: int) -> GatheredLight:
+    return gathered_light(gatherer, view.points, view.to_eye, stream, seed)
 
 
-def _followed(gatherer: Gatherer, places: Places, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
-    return gathered_light(gatherer, places.points, to_eye, stream, seed)
+def _interpolated(gatherer: Gatherer, cached: CachedGather, view: ViewSamples, stream: I64, seed: int) -> GatheredLight:
+    return cached.light(places_of(gatherer.snapshot, gatherer.tracer, view, seed), view.to_eye, stream, seed)
 
 
 def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> SurfacePoints:
@@ -264,8 +263,7 @@ def _band(
         seed,
         samples_per_light(gatherer.snapshot, settings.light_samples, settings.dome_samples),
     )
-    places = Places(view.points, _extent(gatherer.snapshot.camera, view))
-    light = find(places, view.to_eye, view.stream.astype(np.int64) & 0x7FFFFFFF, seed)
+    light = find(view, view.stream.astype(np.int64) & 0x7FFFFFFF, seed)
     usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),

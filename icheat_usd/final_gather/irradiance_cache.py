@@ -39,7 +39,7 @@ class CacheSettings:
     noise: float = 0.02  #: relative standard error of a record's irradiance, to which it gets more hemispheres
     most_hemispheres: int = 8
     accuracy: float = 0.35  #: reach of a record, in harmonic mean distances of the surfaces around
-    clearance: float = 0.5  #: and no more of the distance of the nearest one
+    clearance: float = 1.0  #: and no more of the distance of the nearest one
     least_reach: float = 2.5  #: pixels
     most_reach: float = 24.0  #: pixels
     most_turn: float = 20.0  #: degrees between normals
@@ -83,6 +83,24 @@ class Places(NamedTuple):
 
     points: SurfacePoints  #: (m,)
     extent: F32  #: (m,) metres that a pixel spans there
+    near: F32  #: (m,) metres to the nearest surface that a few rays have met, inf where they met none
+
+    def take(self, which: I64) -> Places:
+        """Some of them."""
+        return Places(take_points(self.points, which), self.extent[which], self.near[which])
+
+    def limit(self, settings: CacheSettings) -> F32:
+        """(m,) metres beyond which no record is asked: in a narrow gap those outside of it know nothing."""
+        return np.maximum(self.near, settings.least_reach * self.extent).astype(np.float32)
+
+
+def join_places(parts: list[Places]) -> Places:
+    """All of them, one after another."""
+    return Places(
+        concatenate_points(*(part.points for part in parts)),
+        np.concatenate([part.extent for part in parts]),
+        np.concatenate([part.near for part in parts]),
+    )
 
 
 @dataclass(eq=False)
@@ -149,8 +167,9 @@ class IrradianceCache:
             self._points = [concatenate_points(*self._points)]
         return self._points[0]
 
-    def find(self, position: F32, normal: F32) -> Lookup:
+    def find(self, places: Places) -> Lookup:
         """Records that reach some places."""
+        position, normal = places.points.position, places.points.shading_normal
         m = len(position)
         found = Lookup(
             np.zeros(m, np.int32),
@@ -159,7 +178,8 @@ class IrradianceCache:
             np.zeros(m, np.float32),
         )
         if self.n:
-            kernels.find_records(self.table, self._hash(), position, normal, *found)
+            limit = places.limit(self.settings)
+            kernels.find_records(self.table, self._hash(), position, normal, limit, *found)
         return found
 
     def interpolate(
@@ -209,9 +229,15 @@ class IrradianceCache:
         parts = [self.table, *(table for table, _ in tables)]
         self.table = kernels.RecordTable(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         self._least = np.concatenate([self._least, *(least for _, least in tables)])
+        order = np.argsort(self.table.position[:, 0], kind="stable")
         clamped = np.empty(self.n, np.float32)
-        kernels.clamp_to_neighbours(self.table.position, self.table.reach, first, clamped)
-        np.maximum(clamped, self._least, out=self.table.reach)
+        kernels.clamp_to_neighbours(
+            np.take(self.table.position, order, axis=0),
+            self.table.reach[order],
+            (order < first).astype(np.uint8),
+            clamped,
+        )
+        self.table.reach[order] = np.maximum(clamped, self._least[order])
         self.values = RecordValues(
             *(np.concatenate([old, *new]) for old, new in zip(self.values, zip(*values, strict=True), strict=True))
         )
@@ -276,7 +302,7 @@ class IrradianceCache:
         """Old records end before new ones that they predict badly."""
         if self.n == 0:
             return
-        found = self.find(places.points.position, places.points.shading_normal)
+        found = self.find(places)
         joined = RecordValues(*(np.concatenate(pair) for pair in zip(self.values, fresh, strict=True)))
         place = [np.concatenate([self.table.position, places.points.position])]
         place.append(np.concatenate([self.table.normal, places.points.shading_normal]))
@@ -332,7 +358,7 @@ def fill(cache: IrradianceCache, places: Places, due: I64) -> None:
     """Records for those of some places that are not covered."""
     if len(due) == 0:
         return
-    found = cache.find(np.take(places.points.position, due, axis=0), np.take(places.points.shading_normal, due, axis=0))
-    new = due[found.coverage < cache.settings.coverage]
+    some = places.take(due)
+    new = np.flatnonzero(cache.find(some).coverage < cache.settings.coverage)
     if len(new):
-        cache.add(Places(take_points(places.points, new), places.extent[new]))
+        cache.add(some.take(new))

@@ -147,24 +147,40 @@ def _sums_of_record(  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def clamp_to_neighbours(position, reach, first, out):  # type: ignore[no-untyped-def]
+def clamp_to_neighbours(position, reach, old, out):  # type: ignore[no-untyped-def]
     """Reach of records, no more than that of any other and the distance to it (Krivanek 2006, 4.2).
 
-    What is near one record is near another beside it. Records before `first`
-    were compared with each other already. `out` is (n,) float32.
+    What is near one record is near another beside it.
+
+    Parameters
+    ----------
+    position : (n, 3) float32
+        Ascending in x.
+    reach : (n,) float32
+    old : (n,) uint8
+        1 for records that were compared with each other already.
+    out : (n,) float32
     """
     for i in prange(len(reach)):
-        least = reach[i]
-        for j in range(0 if i >= first else first, len(reach)):
-            if reach[j] < least:
-                x = position[j, 0] - position[i, 0]
-                y = position[j, 1] - position[i, 1]
-                z = position[j, 2] - position[i, 2]
+        out[i] = _clamped(i, position, reach, old)
+
+
+@kernel
+def _clamped(i, position, reach, old):  # type: ignore[no-untyped-def]
+    least = reach[i]
+    px, py, pz = position[i, 0], position[i, 1], position[i, 2]
+    for step in (-1, 1):
+        j = i + step
+        # Whatever is further than `least` cannot limit it.
+        while 0 <= j < len(reach) and abs(position[j, 0] - px) < least:
+            if reach[j] < least and not (old[i] and old[j]):
+                x, y, z = position[j, 0] - px, position[j, 1] - py, position[j, 2] - pz
                 d2 = x * x + y * y + z * z
                 left = least - reach[j]
                 if d2 < left * left:
                     least = reach[j] + np.float32(np.sqrt(d2))
-        out[i] = least
+            j += step
+    return least
 
 
 @kernel
@@ -224,21 +240,22 @@ def fill_hash(keys, table, begin, end):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _weight(position, normal, reach, turn, trust, r, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Weight of a record at a place, 0 to 1; it ends smoothly where the record does."""
+def _weight(position, normal, reach, turn, trust, r, limit, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Weight of a record at a place, 0 to 1; it ends smoothly where the record or the place's own limit does."""
     dx, dy, dz = x - position[r, 0], y - position[r, 1], z - position[r, 2]
     d2 = dx * dx + dy * dy + dz * dz
-    if d2 >= reach[r] * reach[r]:
+    far = min(reach[r], limit)
+    if d2 >= far * far:
         return np.float32(0.0)
     mx, my, mz = normal[r, 0], normal[r, 1], normal[r, 2]
     turned = np.float32(1.0) - (nx * mx + ny * my + nz * mz)
     if turned >= turn[r]:
         return np.float32(0.0)
     height = np.float32(0.5) * (dx * (nx + mx) + dy * (ny + my) + dz * (nz + mz))
-    if abs(height) > _STEP * reach[r]:
+    if abs(height) > _STEP * far:
         return np.float32(0.0)
     # Turns count from the noise of float32 normals on.
-    error = np.float32(np.sqrt(d2)) / reach[r] + np.float32(np.sqrt(max(turned, np.float32(0.0)) / turn[r]))
+    error = np.float32(np.sqrt(d2)) / far + np.float32(np.sqrt(max(turned, np.float32(0.0)) / turn[r]))
     if error >= np.float32(1.0):
         return np.float32(0.0)
     left = np.float32(1.0) - error
@@ -246,7 +263,7 @@ def _weight(position, normal, reach, turn, trust, r, x, y, z, nx, ny, nz):  # ty
 
 
 @parallel_kernel
-def find_records(table, index, position, normal, count, record, weight, coverage):  # type: ignore[no-untyped-def]
+def find_records(table, index, position, normal, limit, count, record, weight, coverage):  # type: ignore[no-untyped-def]
     """Records that reach each of m places, and weights that add up to 1.
 
     Parameters
@@ -254,6 +271,8 @@ def find_records(table, index, position, normal, count, record, weight, coverage
     table, index : RecordTable, RecordHash
     position, normal : (m, 3) float32
         World space; shading normals.
+    limit : (m,) float32
+        Metres beyond which no record can know the light of the place.
     count : (m,) int32, record : (m, MAX_ENTRIES) int32, weight : (m, MAX_ENTRIES) float32, out
     coverage : (m,) float32, out
         Sum of the weights before.
@@ -273,6 +292,7 @@ def find_records(table, index, position, normal, count, record, weight, coverage
             index.record,
             position,
             normal,
+            limit,
             count,
             record,
             weight,
@@ -295,6 +315,7 @@ def _find_at(  # type: ignore[no-untyped-def]
     listed,
     position,
     normal,
+    limit,
     count,
     record,
     weight,
@@ -310,7 +331,7 @@ def _find_at(  # type: ignore[no-untyped-def]
             continue
         for e in range(begin[slot], end[slot]):
             r = listed[e]
-            w = _weight(at, facing, reach, turn, trust, r, x, y, z, nx, ny, nz)
+            w = _weight(at, facing, reach, turn, trust, r, limit[p], x, y, z, nx, ny, nz)
             if not w > np.float32(0.0):
                 continue
             total += w

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.facts import facts
@@ -21,12 +21,14 @@ from icheat_usd.session import authoring, films, keys, layer_names
 from icheat_usd.session.disk_cache import DiskCache
 from icheat_usd.session.quality import FINAL, PREVIEW, Quality
 from icheat_usd.session.rendering import render_film
-from icheat_usd.session.replaying import FrameReplay
 from icheat_usd.session.shot_parts import Memory, ShotParts
 from icheat_usd.stage import open_stage, take_snapshot
 from icheat_usd.stage.authoring import Members
 from icheat_usd.stage.edit_stack import read_edit_stack
 from icheat_usd.stage.stacks import find_stack
+
+if TYPE_CHECKING:
+    from icheat_usd.session.replaying import FrameReplay
 
 
 class Session(ShotParts):
@@ -217,6 +219,8 @@ class Session(ShotParts):
 
     def replay(self, settings: GatherSettings = FINAL, layers: Sequence[str] = layer_names.DEFAULT) -> FrameReplay:
         """Render a final frame and keep what its rays brought, to make it again whenever edits have changed."""
+        from icheat_usd.session.replaying import FrameReplay
+
         return FrameReplay(self, settings, layers)
 
     def metadata(self, renderer: str, stack: EditStack, settings: Mapping[str, Any]) -> dict[str, str]:

@@ -10,10 +10,11 @@ import pytest
 
 from icheat_usd.edits.model import Edit, KeyedPayload, MaskedSurface, Payload, SurfaceMask
 from icheat_usd.final_gather import CacheSettings
-from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Places, overture
+from icheat_usd.final_gather.irradiance_cache import IrradianceCache, overture
+from icheat_usd.final_gather.places import places_of
 from icheat_usd.final_gather.record_rays import HemisphereTracer
 from icheat_usd.kernels.irradiance_cache import MAX_ENTRIES
-from icheat_usd.materials import points_on_surface, take_points
+from icheat_usd.materials import points_on_surface
 from icheat_usd.samples import gather_samples, view_samples
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.tracing import build_tracer
@@ -36,14 +37,14 @@ class Built:
             snapshot, self.tracer, self.gather, settings.n_theta, settings.n_phi, seed=5
         )
         self.cache = IrradianceCache(self.hemispheres, cells, settings)
-        window = snapshot.camera.window
-        extent = self.view.depth * np.float32((window[1] - window[0]) / snapshot.camera.width)
-        overture(self.cache, Places(self.view.points, extent), self.view.pixel, snapshot.camera.width)
+        self.places = places_of(snapshot, self.tracer, self.view, seed=1)
+        overture(self.cache, self.places, self.view.pixel, snapshot.camera.width)
 
-    def irradiance(self, points):
-        found = self.cache.find(points.position, points.shading_normal)
+    def irradiance(self, which=slice(None)):
+        places = self.places.take(np.arange(self.view.n)[which])
+        found = self.cache.find(places)
         assert (found.number > 0).all()
-        return self.cache.interpolate(found, points.position, points.shading_normal)
+        return self.cache.interpolate(found, places.points.position, places.points.shading_normal)
 
 
 def sized(snapshot: SceneSnapshot, size: int) -> SceneSnapshot:
@@ -52,7 +53,7 @@ def sized(snapshot: SceneSnapshot, size: int) -> SceneSnapshot:
 
 def test_where_everything_sends_the_same_light_irradiance_is_that_times_pi():
     built = Built(sized(closed_box(), 24), lambda points: np.float32(0.7), CacheSettings(n_theta=8))
-    np.testing.assert_allclose(built.irradiance(built.view.points), 0.7 * np.pi, rtol=1e-4)
+    np.testing.assert_allclose(built.irradiance(), 0.7 * np.pi, rtol=1e-4)
     values = built.cache.values
     np.testing.assert_allclose(values.by_turn, 0, atol=1e-4)
     # What a few rays of a record beside a wall meet there is no gradient of the light.
@@ -133,7 +134,7 @@ def test_light_does_not_leak_through_a_wall():
     assert dark.cache.n > 20
     seen = dark.view.points.position[:, 0] < -1e-3
     # A cell of the room may lie on both sides of the wall, a cell being about 6 cm wide.
-    assert dark.irradiance(take_points(dark.view.points, seen)).mean() < 0.01 * np.pi
+    assert dark.irradiance(seen).mean() < 0.01 * np.pi
 
 
 def test_a_place_knows_no_more_records_than_there_is_room_for():
@@ -141,10 +142,10 @@ def test_a_place_knows_no_more_records_than_there_is_room_for():
     crowded = CacheSettings(n_theta=4, coverage=1e9)
     hemispheres = HemisphereTracer(SCENE, built.tracer, built.gather, crowded.n_theta, crowded.n_phi, seed=5)
     cache = IrradianceCache(hemispheres, built.cache.cells, crowded)
-    points = built.view.points
-    overture(cache, Places(points, np.full(built.view.n, 0.3, np.float32)), built.view.pixel, SCENE.camera.width)
+    wide = built.places._replace(extent=np.full(built.view.n, 0.3, np.float32))
+    overture(cache, wide, built.view.pixel, SCENE.camera.width)
     assert cache.n == built.view.n
-    found = cache.find(points.position, points.shading_normal)
+    found = cache.find(wide)
     assert found.number.max() == MAX_ENTRIES
     np.testing.assert_allclose(found.weight.sum(axis=1), 1, rtol=1e-5)
 
