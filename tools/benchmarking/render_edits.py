@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ from icheat_usd.stage import open_stage, take_snapshot
 from tools.benchmarking.made_up_edits import one_edit, painted
 from tools.benchmarking.parts import Effort
 from tools.benchmarking.render_efforts import usual
-from tools.benchmarking.render_frame import Frame, warm
+from tools.benchmarking.render_frame import Frame, replay, warm
 
 #: Least share of the view, and of the hits, that edits act on.
 LEAST_SHARE = 0.3
@@ -36,10 +35,6 @@ _COUNTS, _QUICK_COUNTS = (1, 8, 64), (1, 3)
 _ROUNDS, _QUICK_ROUNDS = 5, 1
 _BAKED = 8  #: different rows; more edits than that share them
 _PILOT = 8192  #: places of the view that shares of hits are found from
-
-#: Prepares the replay of a stack: given the frame and the stack, returns what renders it again with other amounts, from
-#: what one render kept. None while the final gather keeps nothing.
-REPLAY: Callable[[Frame, EditStack], Callable[[EditStack], object]] | None = None
 
 
 class Shares(NamedTuple):
@@ -192,9 +187,9 @@ def _covered(shares: Shares, stack: EditStack) -> dict[str, Any]:
 
 def _replay(frame: Frame, stack: EditStack, render_seconds: float, quick: bool) -> dict[str, Any] | None:
     """Time of a changed amount from what one render kept."""
-    if REPLAY is None:
+    again = replay(frame, stack)
+    if again is None:
         return None
-    again = REPLAY(frame, stack)
     seconds = []
     for i in range(2 if quick else 12):
         changed = replace(stack, edits=tuple(replace(edit, amount=0.3 + 0.05 * i) for edit in stack.edits))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 
@@ -11,7 +12,7 @@ from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import EMPTY_STACK, EditStack
 from icheat_usd.final_gather import FinalGather, final_gather
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, SceneSnapshot
+from icheat_usd.scene import F32, F64, SceneSnapshot
 from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.tracing import Tracer
 from tools.benchmarking.render_efforts import RenderEffort
@@ -56,7 +57,7 @@ class Frame:
         """A stack that knows the scene."""
         return bind(stack, self.snapshot)
 
-    def render(self, field: EditField) -> tuple[FinalGather, float]:
+    def render(self, field: EditField, *, is_kept: bool = False) -> tuple[FinalGather, float]:
         """The frame, and the seconds that it took with all that it needs but the tracer."""
         is_lit = self.effort.settings.method == "cached" or field.uses_incident or field.has_offset
         _ = self.tracer
@@ -69,8 +70,15 @@ class Frame:
             settings=self.effort.settings,
             gather=gather,
             gather_radiance=radiance,
+            is_kept=is_kept,
         )
         return found, time.perf_counter() - start
+
+
+def replay(frame: Frame, stack: EditStack) -> Callable[[EditStack], F64] | None:
+    """What makes the indirect light of a frame again under other stacks; None if its method keeps nothing."""
+    kept = frame.render(frame.field(stack), is_kept=True)[0].replay
+    return None if kept is None else lambda changed: kept.edited(frame.field(changed))
 
 
 def warm(snapshot: SceneSnapshot, effort: RenderEffort, stack: EditStack = EMPTY_STACK) -> None:
