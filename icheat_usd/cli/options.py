@@ -165,3 +165,14 @@ def file_size(n: int) -> str:
     if n < 999_500:
         return f"{n} B" if n < 1000 else f"{n / 1000:.3g} kB"
     return f"{n / 1e6:.3g} MB" if n < 999_500_000 else f"{n / 1e9:.3g} GB"
+
+
+def fraction(text: str) -> float:
+    """A share of something: above 0, at most 1."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value <= 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is no share between 0 and 1, such as 0.02")
+    return value

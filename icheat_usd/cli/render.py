@@ -22,7 +22,7 @@ import argparse
 from dataclasses import replace
 from typing import Any
 
-from icheat_usd.cli.options import add_image, positive
+from icheat_usd.cli.options import add_image, fraction, positive
 from icheat_usd.session.layer_names import DEFAULT, FAMILIES, LAYERS
 
 _WIDTH = max(map(len, (*LAYERS, *FAMILIES)))
@@ -49,6 +49,12 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
         choices=("cached", "brute"),
         help="cached: irradiance is interpolated where it is smooth; brute: every camera sample gathers for itself, "
         "slow and unbiased",
+    )
+    parser.add_argument(
+        "--noise",
+        type=fraction,
+        metavar="SHARE",
+        help="relative error that a record of cached light may have by chance; default 0.02",
     )
     parser.add_argument(
         "--photons", action="store_true", help="earlier bounces by a photon map instead of the gather samples"
@@ -83,4 +89,7 @@ def command(options: argparse.Namespace) -> int:
         "denoise": options.denoise or None,
     }
     chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    return render_frames(options, replace(GatherSettings(seed=options.seed), **chosen))
+    settings = replace(GatherSettings(seed=options.seed), **chosen)
+    if options.noise is not None:
+        settings = replace(settings, cache=replace(settings.cache, noise=options.noise))
+    return render_frames(options, settings)
