@@ -44,7 +44,12 @@ class CachedGather:
         self._is_kept = is_kept
         self.samples: list[Sampled] = []
         stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
-        self._stacks = [(stack, EditedRecords(stack, cache)) for stack in stacks]
+        self._stacks: list[tuple[Gatherer, EditedRecords]] = []
+        known = None
+        for stack in stacks:
+            records = EditedRecords(stack, cache, known)
+            known = records.by_caster or known
+            self._stacks.append((stack, records))
 
     def light(self, places: Places, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
         """Radiance towards the eye; points that no edit touches have the same bits in both results."""

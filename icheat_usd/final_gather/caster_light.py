@@ -9,7 +9,7 @@ from icheat_usd.edits.field import EditField
 from icheat_usd.edits.operations import Level
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, RecordValues
 from icheat_usd.final_gather.record_rays import take_rays
-from icheat_usd.kernels import irradiance_cache as kernels
+from icheat_usd.kernels import record_sums
 from icheat_usd.scene import F32, I64, Bool
 
 _RAYS_AT_ONCE = 1 << 19
@@ -36,7 +36,7 @@ class CasterLight:
     """
 
     def __init__(self, cache: IrradianceCache, b: F32) -> None:
-        self._cache, self.n_groups = cache, len(b)
+        self._cache, self._n_groups = cache, len(b)
         # Added emission travels on transport alone, which is the light of cells that send 1.
         sent = np.concatenate([*b, np.ones_like(b[0])], axis=1)
         self._sent = np.concatenate([sent, np.zeros((1, sent.shape[1]), np.float32)])
@@ -66,14 +66,14 @@ class CasterLight:
         factor, added = _coefficients(field, is_in)
         instance = self._instance[some]
         order = slot[self._record[some]]
-        groups = [factor[:, group][instance] for group in range(self.n_groups)]
+        groups = [factor[:, group][instance] for group in range(self._n_groups)]
         weights = np.concatenate([*groups, added[instance]], axis=1)
         n = int(needed.sum())
         out = RecordValues(np.zeros((n, 3), np.float32), *(np.zeros((n, 3, 3), np.float32) for _ in range(2)))
         for total, column in zip(out, self._values, strict=True):
             shape = weights.shape + (1,) * (column.ndim - 2)
             light = column[some] * weights.reshape(shape)
-            np.add.at(total, order, light.reshape(len(some), self.n_groups + 1, 3, *column.shape[2:]).sum(axis=1))
+            np.add.at(total, order, light.reshape(len(some), self._n_groups + 1, 3, *column.shape[2:]).sum(axis=1))
         out.by_move[...] *= self._cache.shrink[needed][:, None, None]
         return out
 
@@ -109,7 +109,7 @@ class CasterLight:
         n, n_rays = instance.shape
         local, listed = np.empty((n, n_rays), np.int16), np.empty((n, n_rays), np.int32)
         number = np.empty(n, np.int32)
-        kernels.list_casters(instance, local, number, listed)
+        record_sums.list_casters(instance, local, number, listed)
         begin = np.concatenate([[0], np.cumsum(number, dtype=np.int64)])
         total, channels = int(begin[-1]), self._sent.shape[1]
         light = RecordValues(
@@ -117,7 +117,7 @@ class CasterLight:
             np.zeros((total, channels, 3), np.float32),
             np.zeros((total, channels, 3), np.float32),
         )
-        kernels.caster_sums(
+        record_sums.caster_sums(
             rays.radiance(self._sent),
             rays.distance,
             local,

@@ -35,14 +35,15 @@ class EditedRecords:
     cache : IrradianceCache
         Its rays are kept.
     by_caster : CasterLight, optional
-        Of another stack that tells the same groups of lights apart, if both stacks are `is_of_objects`.
+        Of another stack that tells the same groups of lights apart.
     """
 
     def __init__(self, gatherer: Gatherer, cache: IrradianceCache, by_caster: CasterLight | None = None) -> None:
         self._gatherer, self._cache = gatherer, cache
-        self.by_caster = by_caster
-        if by_caster is None and gatherer.solution is not None and is_of_objects(gatherer.field):
-            self.by_caster = CasterLight(cache, gatherer.solution.b)
+        self.by_caster: CasterLight | None = None
+        if is_of_objects(gatherer.field):
+            assert gatherer.solution is not None
+            self.by_caster = by_caster or CasterLight(cache, gatherer.solution.b)
         self._slots: dict[bytes, np.ndarray] = {}
         self._values = RecordValues(
             np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty((0, 3, 3), np.float32)

@@ -14,6 +14,7 @@ import numpy as np
 
 from icheat_usd.final_gather.record_rays import HemisphereTracer, RecordRays, concatenate_rays
 from icheat_usd.kernels import irradiance_cache as kernels
+from icheat_usd.kernels import record_sums
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import F32, I32, I64, SurfacePoints
@@ -201,7 +202,7 @@ class IrradianceCache:
             np.empty((n, channels, 3), np.float32),
         )
         spread = np.empty((n, 3), np.float32)
-        kernels.record_sums(
+        record_sums.record_sums(
             radiance,
             rays.distance,
             rays.shading_normal,

@@ -10,7 +10,7 @@ import numpy as np
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.final_gather.cached import CachedGather, under_stack
-from icheat_usd.final_gather.caster_light import CasterLight, is_of_objects
+from icheat_usd.final_gather.caster_light import CasterLight
 from icheat_usd.final_gather.edited_records import EditedRecords
 from icheat_usd.final_gather.gatherer import Gatherer, GatherSolution
 from icheat_usd.samples import ViewSamples
@@ -55,10 +55,10 @@ class Replay:
         """
         gatherer = self._under(field)
         cache = self._cached.cache
-        fits = self._by_caster is not None and self._by_caster.n_groups == field.n_groups
-        known = self._by_caster if fits and is_of_objects(field) and field.n_groups == 1 else None
-        records = EditedRecords(gatherer, cache, known)
-        self._by_caster = records.by_caster or self._by_caster
+        # Light of all lamps together is the same for all stacks; which lamps another one tells apart is not known.
+        is_one = field.n_groups == 1
+        records = EditedRecords(gatherer, cache, self._by_caster if is_one else None)
+        self._by_caster = (records.by_caster if is_one else None) or self._by_caster
         parts = []
         for (pixels, view), sampled in zip(self._bands, self._cached.samples, strict=True):
             light = sampled.base if field.is_identity else under_stack(gatherer, records, sampled)
