@@ -61,11 +61,13 @@ class CasterLight:
             Changes for the needed records, ascending.
         """
         self._find(needed)
-        some = np.flatnonzero(needed[self._record])
-        slot = np.cumsum(needed) - 1
         factor, added = _coefficients(field, is_in)
+        acts: Bool = np.asarray(factor.any(axis=(1, 2)) | added.any(axis=1), np.bool_)
+        some = np.flatnonzero(needed[self._record] & acts[self._instance])
         instance = self._instance[some]
-        order = slot[self._record[some]]
+        record = self._record[some]
+        begin = np.flatnonzero(np.diff(record, prepend=-1))
+        slot = (np.cumsum(needed) - 1)[record[begin]]
         groups = [factor[:, group][instance] for group in range(self._n_groups)]
         weights = np.concatenate([*groups, added[instance]], axis=1)
         n = int(needed.sum())
@@ -73,7 +75,9 @@ class CasterLight:
         for total, column in zip(out, self._values, strict=True):
             shape = weights.shape + (1,) * (column.ndim - 2)
             light = column[some] * weights.reshape(shape)
-            np.add.at(total, order, light.reshape(len(some), self._n_groups + 1, 3, *column.shape[2:]).sum(axis=1))
+            light = light.reshape(len(some), self._n_groups + 1, 3, *column.shape[2:]).sum(axis=1)
+            if len(some):
+                total[slot] = np.add.reduceat(light, begin, axis=0)
         out.by_move[...] *= self._cache.shrink[needed][:, None, None]
         return out
 
@@ -96,8 +100,10 @@ class CasterLight:
             records.append(owner[row])
             instances.append(instance)
             values.append(light)
-        self._record, self._instance = np.concatenate(records), np.concatenate(instances)
-        self._values = RecordValues(*(np.concatenate(columns) for columns in zip(*values, strict=True)))
+        record = np.concatenate(records)
+        order = np.argsort(record, kind="stable")
+        self._record, self._instance = record[order], np.concatenate(instances)[order]
+        self._values = RecordValues(*(np.concatenate(columns)[order] for columns in zip(*values, strict=True)))
 
     def _of_hemispheres(self, chunk: I64) -> tuple[I64, I64, RecordValues]:
         """Row in the chunk, instance, and light of every pair of a hemisphere and what it sees."""
