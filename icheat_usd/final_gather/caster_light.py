@@ -108,10 +108,7 @@ class CasterLight:
     def _of_hemispheres(self, chunk: I64) -> tuple[I64, I64, RecordValues]:
         """Row in the chunk, instance, and light of every pair of a hemisphere and what it sees."""
         rays = take_rays(self._cache.rays, chunk)
-        instance = np.where(rays.cell >= 0, rays.instance, np.int32(-1))
-        instance.reshape(-1)[rays.detour] = np.where(
-            rays.cell.reshape(-1)[rays.detour] >= 0, rays.detour_ends.instance, -1
-        )
+        instance = rays.sender
         n, n_rays = instance.shape
         local, listed = np.empty((n, n_rays), np.int16), np.empty((n, n_rays), np.int32)
         number = np.empty(n, np.int32)

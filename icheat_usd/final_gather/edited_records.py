@@ -19,7 +19,7 @@ from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, RecordValues
 from icheat_usd.final_gather.record_rays import RecordRays, take_rays
 from icheat_usd.materials import take_points
-from icheat_usd.scene import F32, I64, U8, Bool, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, U8, Bool, SurfacePoints
 
 #: Masks of one receiver between 0 and 1; with more, mixtures would be of more than 16 sets.
 MOST_SOFT = 4
@@ -128,7 +128,7 @@ class RecordPairs:
         self._field = gatherer.field
         assert gatherer.solution is not None
         self._rays = rays
-        self._flat = np.flatnonzero(rays.cell.reshape(-1) >= 0)
+        self._flat = np.flatnonzero(_may_send(self._field, rays.sender.reshape(-1)))
         self._casters = self._field.casters(rays.ends(gatherer.snapshot, self._flat))
         self._receivers = self._field.receivers(points)
         self._located = _is_located(self._receivers, self._field)
@@ -199,6 +199,13 @@ class RecordPairs:
                 changed[went] *= rays.throughput[entry[went]]
             out.reshape(-1, 3)[flat] = changed
         return out[rows]
+
+
+def _may_send(field: EditField, instance: I32) -> Bool:
+    """(n,) whether an edit may have casters on these instances, -1 for none."""
+    weights = [casters.on_instances for bound in field.edits for casters in bound.casters]
+    selected = np.append(np.stack(weights).any(axis=0), False)
+    return np.take(selected, instance)
 
 
 def _spread(values: F32, rows: I64, n: int) -> F32:

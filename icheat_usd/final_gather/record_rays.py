@@ -38,6 +38,14 @@ class RecordRays(NamedTuple):
     def n_rays(self) -> int:
         return self.n_theta * self.n_phi
 
+    @property
+    def sender(self) -> I32:
+        """(n, n_rays) instance that sends each ray its light, behind mirrors and glass too; -1 for none."""
+        found = np.where(self.cell >= 0, self.instance, np.int32(-1))
+        lit = self.cell.reshape(-1)[self.detour] >= 0
+        found.reshape(-1)[self.detour] = np.where(lit, self.detour_ends.instance, np.int32(-1))
+        return found
+
     def radiance(self, of_cells: F32) -> F32:
         """What each ray brings, (n, n_rays, C), when cells send `of_cells` (n_cells + 1, C), the last row zero."""
         nothing = len(of_cells) - 1
