@@ -18,8 +18,9 @@ from icheat_usd.scene import F64, SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import Bounces, CellLight, Transport, build_bounces, build_transport, light_cells
 
-#: Records of an image so small that two pixels are a tenth of it.
-TINY = CacheSettings(n_theta=16, least_reach=0.5)
+#: Records of an image so small that two pixels are a tenth of it. They end half way to the nearest surface, as nothing
+#: else keeps them from being as wide as what operations that look at the receiver's place vary over.
+TINY = CacheSettings(n_theta=16, least_reach=0.5, clearance=0.5)
 
 
 @dataclass

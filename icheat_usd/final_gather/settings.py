@@ -23,7 +23,7 @@ class GatherSettings:
 
     samples_per_pixel: int = 4
     gather_rays: int = 64  #: per camera sample and lobe that has no cache
-    light_samples: int = 4  #: shadow rays per light and camera sample, for direct light
+    light_samples: int = 8  #: shadow rays per light and camera sample, for direct light
     n_bounces: int = 16  #: diffuse reflections before the last one
     seed: int = 0
     dome_samples: int | None = None  #: `light_samples` of domes; 4 times those of other lights by default
