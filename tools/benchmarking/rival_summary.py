@@ -21,7 +21,7 @@ def curves_of(results: list[dict[str, Any]]) -> dict[str, dict[str, list[dict[st
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for one in results:
         for name, points in one.get("result", {}).get("curves", {}).items():
-            renderer = "ours" if name.startswith("ours cached") else name
+            renderer = "ours" if name.startswith("ours, cached") else name
             found.setdefault(one["case"]["name"], {}).setdefault(renderer, []).extend(points)
     return {
         stage: {name: sorted(points, key=lambda point: point["seconds"]) for name, points in curves.items()}
