@@ -206,6 +206,7 @@ class SceneSnapshot:
     radius: float  #: of the sphere about the origin that holds all geometry; metres
     findings: tuple[Finding, ...] = field(default=())
     light_controls: tuple[LightControls, ...] = ()  #: of each light; none where all are plain
+    light_tags: tuple[str, ...] = ()  #: of each light: the group that layers show it in, "" for its own; or none at all
 
     def __post_init__(self) -> None:
         if len(self.light_controls) not in (0, len(self.light_paths)):

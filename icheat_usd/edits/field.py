@@ -210,8 +210,12 @@ class EditField:
         mask = casters.masks[aggregate.row]
         return (bound.groups[:, None].astype(np.float32) * mask[None, :])[:, :, None]
 
-    def finish(self, light: F32, receivers: Ends) -> F32:
-        """Apply what acts on views to (n, 3) edited indirect light, then clamp it at zero."""
+    def finish(self, light: F32, receivers: Ends, *, is_part: bool = False) -> F32:
+        """Apply what acts on views to (n, 3) edited indirect light, then clamp it at zero.
+
+        Light of some lights alone, `is_part`, is scaled and no more: what is added is of no light, and only the sum
+        of all lights is clamped.
+        """
         row = 0
         scale: F32 | None = None
         offset: F32 = np.zeros_like(light)
@@ -233,6 +237,8 @@ class EditField:
             if bound.edit.blend is not Blend.COMPOSE:
                 scale = scale + (kept * (bound.edit.blend is Blend.OVER) + delta)
             offset = carried * offset + added
+        if is_part:
+            return light if scale is None else scale * light
         # Once, at the end: a weaker edit's negative light may be lifted by a stronger one.
         return np.maximum(light if scale is None else scale * light + offset, np.float32(0))
 

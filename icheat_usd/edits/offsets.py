@@ -33,9 +33,10 @@ class OffsetCasters(NamedTuple):
     ends: Ends
     b: F32  #: (G, n, 3) radiance that leaves them, by group of lights
     area: F32  #: (n,) square metres
+    sent: F32 | None = None  #: (G, n, 3) the part of `b` that is added up, where edits look at more than that
 
 
-def offset_casters(field: EditField, casters: Ends, b: F32, area: F32) -> OffsetCasters | None:
+def offset_casters(field: EditField, casters: Ends, b: F32, area: F32, sent: F32 | None = None) -> OffsetCasters | None:
     """Those of the gather samples that lie in the casters of an edit with offsets; None if there are none."""
     if not field.has_offset:
         return None
@@ -44,7 +45,10 @@ def offset_casters(field: EditField, casters: Ends, b: F32, area: F32) -> Offset
         if bound.operation is None or bound.operation.has_offset:
             rows += range(*field.rows_of(edit).indices(field.n_rows))
     which = np.flatnonzero((casters.masks[rows] > 0).any(axis=0))
-    return OffsetCasters(casters.take(which), np.take(b, which, axis=1), area[which]) if len(which) else None
+    if len(which) == 0:
+        return None
+    part = None if sent is None else np.take(sent, which, axis=1)
+    return OffsetCasters(casters.take(which), np.take(b, which, axis=1), area[which], part)
 
 
 def patches(casters: OffsetCasters) -> OffsetCasters:
@@ -62,15 +66,18 @@ def patches(casters: OffsetCasters) -> OffsetCasters:
     begin = np.flatnonzero(breaks)
     end = np.append(begin[1:], n)
     area = np.add.reduceat(casters.area, begin).astype(np.float32)
-    light = np.add.reduceat(casters.area[:, None] * casters.b, begin, axis=1)
     whole = np.maximum(area, np.float32(1e-30))[:, None]
+
+    def mean(light: F32) -> F32:
+        return (np.add.reduceat(casters.area[:, None] * light, begin, axis=1) / whole).astype(np.float32)
+
     ends = casters.ends.take((begin + end - 1) // 2)
     masks = np.add.reduceat(casters.area * casters.ends.masks, begin, axis=1) / whole[:, 0]
     ends = ends._replace(masks=masks.astype(np.float32))
     if casters.ends.place is not None and ends.place is not None:
         position = np.add.reduceat(casters.area[:, None] * casters.ends.place.position, begin, axis=0) / whole
         ends = ends._replace(place=ends.place._replace(position=position.astype(np.float32)))
-    return OffsetCasters(ends, (light / whole).astype(np.float32), area)
+    return OffsetCasters(ends, mean(casters.b), area, None if casters.sent is None else mean(casters.sent))
 
 
 def offset_radiance(
@@ -149,9 +156,10 @@ def offset_sums(
 ) -> tuple[F64, F64]:
     """Light that the albedo of `which` receivers reflects and light that it does not, (n, 3) each."""
     n_casters = len(casters.area)
-    counted = casters.area[:, None] * casters.b
     if aggregate is not None:
-        counted = field.aggregate_share(aggregate, casters.ends) * counted
+        counted = field.aggregate_share(aggregate, casters.ends) * (casters.area[:, None] * casters.b)
+    else:
+        counted = casters.area[:, None] * (casters.b if casters.sent is None else casters.sent)
     if len(which) == 1:
         ends, b, here = casters.ends, casters.b, receivers.take(which)
         at_receivers = [of_receivers(found, which) for found in resolved]

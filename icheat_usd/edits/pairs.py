@@ -23,6 +23,7 @@ class PairLight(NamedTuple):
     brought: F32  #: (G, n, 3) radiance that arrives: transport times what leaves
     emitted: F32  #: (n, 3) transport, on which added emission travels; `brought` is this times `seen`, but for noise
     through: int | None = None  #: slot of `EditField.throughs` whose occluders hold this light back
+    is_part: bool = False  #: `brought` is of some lights alone; what edits add that is of no light is none of it
 
 
 def arriving(
@@ -85,7 +86,8 @@ def edited_light(
                 coefficients = field.evaluate(part.seen, receivers.take(part.owner), part.casters, here, upto)
                 # Curves must not see more noise than they have to: they would turn it into bias.
                 arrives = part.brought if aggregate is None else part.emitted * part.seen
-                edited = arriving(field, coefficients, arrives, part.emitted, part.casters, part.through, aggregate)
+                emitted = np.float32(0) if part.is_part and aggregate is None else part.emitted
+                edited = arriving(field, coefficients, arrives, emitted, part.casters, part.through, aggregate)
                 if edited is not None:
                     light += _sum_by(part.owner, edited, n)
         result: F32 = light.astype(np.float32)
@@ -125,6 +127,7 @@ def _parts(block: PairLight) -> Iterator[PairLight]:
             block.brought[:, some],
             block.emitted[some],
             block.through,
+            block.is_part,
         )
 
 

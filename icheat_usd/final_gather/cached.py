@@ -12,12 +12,15 @@ from icheat_usd.final_gather.gatherer import (
     GatheredLight,
     Gatherer,
     Lobe,
+    clamped_like,
     diffuse_lobe,
     light_of_pairs,
+    relit,
     specular_lobe,
     touched_receivers,
 )
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, Places
+from icheat_usd.final_gather.light_parts import light_of_records
 from icheat_usd.final_gather.record_rays import RecordRays, take_rays
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.materials import take_points
@@ -43,6 +46,7 @@ class CachedGather:
         self._gatherer, self.cache, self._glossy_rays = gatherer, cache, glossy_rays
         self._is_kept = is_kept
         self.samples: list[Sampled] = []
+        self._parts = CachedParts(gatherer.parts, cache)
         stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
         self._stacks: list[tuple[Gatherer, EditedRecords]] = []
         known = None
@@ -53,6 +57,15 @@ class CachedGather:
 
     def light(self, places: Places, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
         """Radiance towards the eye; points that no edit touches have the same bits in both results."""
+        sample = self._sample(places, to_eye, stream, seed)
+        if self._is_kept:
+            self.samples.append(sample)
+        if not self._stacks:
+            return GatheredLight(sample.base, sample.base.copy(), (), self._parts.light(sample, sample.base))
+        *steps, edited = (under_stack(stack, records, sample) for stack, records in self._stacks)
+        return GatheredLight(sample.base, edited, tuple(steps), self._parts.light(sample, edited))
+
+    def _sample(self, places: Places, to_eye: F32, stream: I64, seed: int) -> Sampled:
         points = places.points
         position, normal = points.position, points.shading_normal
         found = self.cache.find(places)
@@ -66,13 +79,7 @@ class CachedGather:
         shiny = specular_lobe(self._gatherer, points, to_eye, stream, self._glossy_rays, seed)
         if shiny is not None:
             base[shiny.where] += shiny.mean()
-        sample = Sampled(points, stream, seed, found, base, shiny, alone, own_rays)
-        if self._is_kept:
-            self.samples.append(sample)
-        if not self._stacks:
-            return GatheredLight(base, base.copy())
-        *steps, edited = (under_stack(stack, records, sample) for stack, records in self._stacks)
-        return GatheredLight(base, edited, tuple(steps))
+        return Sampled(points, stream, seed, found, base, shiny, alone, own_rays)
 
 
 class Sampled(NamedTuple):
@@ -130,7 +137,7 @@ def under_stack(g: Gatherer, records: EditedRecords, sampled: Sampled) -> F32:
             light[rest] += reflected - _brought(len(base), lobes)[where]
         if g.solution is not None and g.solution.offsets is not None:
             light[rest] += offset_radiance(g.field, g.solution.offsets, some, points.albedo[where])
-    edited[touched] = g.field.finish(light, receivers)
+    edited[touched] = g.field.finish(light, receivers, is_part=g.is_part)
     return edited
 
 
@@ -140,6 +147,53 @@ def _brought(n: int, lobes: list[Lobe]) -> F32:
     for lobe in lobes:
         total[lobe.where] += lobe.mean()
     return total
+
+
+class CachedParts:
+    """Light of some lights alone, for each of `Gatherer.parts`, from the rays that the cache has kept."""
+
+    def __init__(self, parts: tuple[Gatherer, ...], cache: IrradianceCache) -> None:
+        self._parts, self._cache = parts, cache
+        if not parts:
+            return
+        sent = []
+        for part in parts:
+            assert part.solution is not None and part.solution.sent is not None
+            sent.append(part.solution.sent.sum(axis=0))
+        cells = np.concatenate(sent, axis=1)
+        self._cells = np.concatenate([cells, np.zeros((1, cells.shape[1]), np.float32)])
+        self._values = light_of_records(cache, self._cells)
+        self._records = [None if part.field.is_identity else EditedRecords(part, cache) for part in parts]
+
+    def light(self, sampled: Sampled, whole: F32) -> tuple[tuple[F32, F32], ...]:
+        """Radiance towards the eye, without edits and with them, of each part; `whole` is the edited light of all."""
+        if not self._parts:
+            return ()
+        points = sampled.points
+        diffuse = self._diffuse(sampled)
+        found = []
+        for part, records, light in zip(self._parts, self._records, diffuse, strict=True):
+            base = points.albedo * (light * _INVERSE_PI)
+            shiny = None if sampled.shiny is None else relit(part, sampled.shiny)
+            if shiny is not None:
+                base[shiny.where] += shiny.mean()
+            if records is None:
+                found.append((base, base.copy()))
+                continue
+            edited = under_stack(part, records, sampled._replace(base=base, shiny=shiny))
+            found.append((base, clamped_like(whole, edited)))
+        return tuple(found)
+
+    def _diffuse(self, sampled: Sampled) -> F32:
+        """Irradiance, (n_parts, n, 3); where gradients lead below zero, the other parts give what is missing."""
+        points, alone = sampled.points, sampled.alone
+        light = self._cache.interpolate(sampled.found, points.position, points.shading_normal, self._values)
+        if sampled.own_rays is not None:
+            light[alone] = np.pi * sampled.own_rays.radiance(self._cells).mean(axis=1)
+        parts = light.reshape(len(light), len(self._parts), 3).transpose(1, 0, 2)
+        wanted, positive = np.maximum(parts.sum(axis=0), 0), np.maximum(parts, 0)
+        there = positive.sum(axis=0)
+        return np.asarray(positive * np.divide(wanted, there, out=np.zeros_like(there), where=there > 0), np.float32)
 
 
 #: Added to the numbers of camera samples, so that their rays are none of a record's.

@@ -7,6 +7,7 @@ import numpy as np
 from icheat_usd.edits.bound import Ends, StackCoefficients
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.operations import Level
+from icheat_usd.final_gather.gatherer import GatherSolution
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, RecordValues
 from icheat_usd.final_gather.record_rays import take_rays
 from icheat_usd.kernels import record_sums
@@ -31,11 +32,13 @@ class CasterLight:
 
     Parameters
     ----------
-    b : (G, n_gather, 3)
-        What gather cells send.
+    solution : GatherSolution
+        What gather cells send, or some lights' part of it, to which nothing that edits add belongs.
     """
 
-    def __init__(self, cache: IrradianceCache, b: F32) -> None:
+    def __init__(self, cache: IrradianceCache, solution: GatherSolution) -> None:
+        b = solution.b if solution.sent is None else solution.sent
+        self._is_part = solution.sent is not None
         self._cache, self._n_groups = cache, len(b)
         # Added emission travels on transport alone, which is the light of cells that send 1.
         sent = np.concatenate([*b, np.ones_like(b[0])], axis=1)
@@ -62,6 +65,8 @@ class CasterLight:
         """
         self._find(needed)
         factor, added = _coefficients(field, is_in)
+        if self._is_part:
+            added = np.zeros_like(added)
         acts: Bool = np.asarray(factor.any(axis=(1, 2)) | added.any(axis=1), np.bool_)
         some = np.flatnonzero(needed[self._record] & acts[self._instance])
         instance = self._instance[some]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,8 +23,9 @@ def with_denoising(extras: Extras) -> Extras:
 def denoised(result: FinalGather, edits: Sequence[str], *, progress: Progress = silent) -> FinalGather:
     """A final gather without its noise: direct light, indirect light, what edits contribute and light groups.
 
-    The unedited light does not depend on the edits; where no edit has a mask above 0, edited light has its bits. Light
-    groups are denoised one by one, so that they sum to the direct light only about.
+    The unedited light does not depend on the edits; where no edit has a mask above 0, edited light has its bits. The
+    direct light of groups of lights is denoised one by one, so that it sums to the whole only about; of indirect
+    light, which edits have borders in, they keep their shares.
 
     Parameters
     ----------
@@ -58,9 +59,20 @@ def denoised(result: FinalGather, edits: Sequence[str], *, progress: Progress = 
         indirect=light.unedited.astype(np.float64),
         indirect_edited=light.edited.astype(np.float64),
         contributions={path: changes.get(path, old).astype(np.float64) for path, old in result.contributions.items()},
-        light_groups={name: clean(layer) for name, layer in result.light_groups.items()},
+        light_groups=_groups(result, light.unedited, light.edited, clean),
     )
     progress("denoise", 1.0)
+    return found
+
+
+def _groups(result: FinalGather, unedited: F32, edited: F32, clean: Callable[[F64], F64]) -> dict[tuple[str, str], F64]:
+    shares = {"indirect": (result.indirect, unedited), "indirect_edited": (result.indirect_edited, edited)}
+    found = {}
+    for (kind, name), layer in result.light_groups.items():
+        if kind in shares:
+            noisy, wanted = shares[kind]
+            layer = layer * np.divide(wanted, noisy, out=np.zeros_like(noisy), where=noisy > 0)
+        found[kind, name] = clean(layer) if kind == "direct" else layer
     return found
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icheat_usd.edits.bound import Ends
+from icheat_usd.edits.bound import Ends, weighted
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.operations import PairEnd
 from icheat_usd.final_gather.caster_light import CasterLight, is_of_objects
@@ -43,7 +43,7 @@ class EditedRecords:
         self.by_caster: CasterLight | None = None
         if is_of_objects(gatherer.field):
             assert gatherer.solution is not None
-            self.by_caster = by_caster or CasterLight(cache, gatherer.solution.b)
+            self.by_caster = by_caster or CasterLight(cache, gatherer.solution)
         self._slots: dict[bytes, np.ndarray] = {}
         self._values = RecordValues(
             np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty((0, 3, 3), np.float32)
@@ -132,7 +132,7 @@ class RecordPairs:
         self._casters = self._field.casters(rays.ends(gatherer.snapshot, self._flat))
         self._receivers = self._field.receivers(points)
         self._located = _is_located(self._receivers, self._field)
-        self._b = gatherer.solution.b
+        self._b, self._sent = gatherer.solution.b, gatherer.solution.sent
 
     def values(self, rows: I64, records: I64, is_in: Bool, cache: IrradianceCache) -> RecordValues:
         """Changes of the irradiance of records `rows`, where receivers are in these edits, and their gradients.
@@ -192,7 +192,11 @@ class RecordPairs:
                 receivers = receivers._replace(place=place)
             seen = np.take(self._b, np.take(rays.cell.reshape(-1), flat), axis=1)
             found = self._field.evaluate(seen, receivers.take(row[touched]), self._casters.take(touched))
-            changed = found.light(seen) - seen.sum(axis=0)
+            if self._sent is None:
+                changed = found.light(seen) - seen.sum(axis=0)
+            else:
+                sent = np.take(self._sent, np.take(rays.cell.reshape(-1), flat), axis=1)
+                changed = weighted(found.scale, sent) - sent.sum(axis=0)
             if len(rays.detour):
                 entry = np.minimum(np.searchsorted(rays.detour, flat), len(rays.detour) - 1)
                 went = rays.detour[entry] == flat

@@ -14,7 +14,7 @@ from icheat_usd.final_gather.gatherer import GatheredLight, Gatherer
 from icheat_usd.image.cryptomatte import Coverage, coverage, name_id
 from icheat_usd.samples import ViewSamples
 from icheat_usd.samples.develop import develop
-from icheat_usd.scene import F32, F64, I64, SceneSnapshot
+from icheat_usd.scene import F64, I64, SceneSnapshot
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,8 @@ class Extras:
 
     contributions: bool = False  #: of each edit
     light_groups: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: MappingProxyType({}))
-    #: paths of lights by the name of the group whose direct light is wanted
+    #: paths of lights by the name of the group whose light is wanted
+    indirect: bool = False  #: whether their indirect light is, too
     objects: bool = False  #: which prims each pixel shows
     edits: bool = False  #: which edits each pixel receives
 
@@ -57,18 +58,6 @@ def contribution_layers(
     steps = [develop(view, step, pixels) for step in (light.base, *light.steps, light.edited)]
     paths = [bound.edit.path for bound in edits.edits]
     return {path: after - before for path, before, after in zip(paths, steps[:-1], steps[1:], strict=True)}
-
-
-def light_layers(
-    extras: Extras, snapshot: SceneSnapshot, per_light: F32, view: ViewSamples, pixels: tuple[int, int]
-) -> dict[str, F64]:
-    """Direct light of each group of lights, (n_pixels, 3) each."""
-    layers = {}
-    for name, paths in extras.light_groups.items():
-        rows = [row for row, path in enumerate(snapshot.light_paths) if path in paths]
-        total: F32 = per_light[rows].sum(axis=0, dtype=np.float32)
-        layers[name] = develop(view, total, pixels)
-    return layers
 
 
 def covered(

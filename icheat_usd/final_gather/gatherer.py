@@ -28,6 +28,7 @@ class GatherSolution:
     b: F32  #: (G, n_gather, 3) by group of lights
     total: F32  #: (n_gather, 3) of all lights; its last bits do not depend on the groups
     offsets: OffsetCasters | None
+    sent: F32 | None = None  #: (G, n_gather, 3) part of `b` that arrives, where edits look at more than that
 
     def at(self, points: SurfacePoints) -> F32:
         """Light that leaves surface points, (G, n, 3)."""
@@ -48,6 +49,12 @@ class Gatherer:
     clear: tuple[Tracer, ...]  #: the scene without the occluders of each of `EditField.throughs`
     prefixes: tuple[Gatherer, ...] = ()  #: the same for the first edits of the stack alone, if their light is wanted
     follows_paths: bool = True  #: light at the ends of gather rays is found by paths; else it is that of `solution`
+    parts: tuple[Gatherer, ...] = ()  #: the same for the light of some lights alone, if it is wanted
+    lights: Bool | None = None  #: (n_lights,) those whose light alone arrives; edits look at all; None: all
+
+    @property
+    def is_part(self) -> bool:
+        return self.lights is not None
 
 
 class GatheredLight(NamedTuple):
@@ -56,6 +63,7 @@ class GatheredLight(NamedTuple):
     base: F32  #: (n, 3) without edits
     edited: F32  #: (n, 3) with them
     steps: tuple[F32, ...] = ()  #: (n, 3) with the first one, the first two, ... of them, for `Gatherer.prefixes`
+    parts: tuple[tuple[F32, F32], ...] = ()  #: `base` and `edited` of each of `Gatherer.parts`
 
 
 class Lobe(NamedTuple):
@@ -88,7 +96,29 @@ def gathered_light(gatherer: Gatherer, points: SurfacePoints, to_eye: F32, strea
         lobes.append(shiny)
         base[shiny.where] += shiny.mean()
     steps = tuple(_under_stack(prefix, points, lobes, base) for prefix in g.prefixes)
-    return GatheredLight(base, _under_stack(g, points, lobes, base), steps)
+    edited = _under_stack(g, points, lobes, base)
+    parts = tuple(_part(part, points, lobes, edited) for part in g.parts)
+    return GatheredLight(base, edited, steps, parts)
+
+
+def _part(part: Gatherer, points: SurfacePoints, lobes: list[Lobe], whole: F32) -> tuple[F32, F32]:
+    """Light of some lights alone, without edits and with them; `whole` is the edited light of all."""
+    own = [relit(part, lobe) for lobe in lobes]
+    base = np.zeros_like(whole)
+    for lobe in own:
+        base[lobe.where] += lobe.mean()
+    return base, clamped_like(whole, _under_stack(part, points, own, base))
+
+
+def clamped_like(whole: F32, part: F32) -> F32:
+    """A part of edited light, nothing where all light together was clamped."""
+    return np.where(whole > 0, part, np.float32(0))
+
+
+def relit(gatherer: Gatherer, lobe: Lobe) -> Lobe:
+    """The same rays with the light that a gatherer finds at their ends."""
+    light = _reflected(gatherer, lobe.rays.ends, lobe.rays.throughput, int(hash_combine(lobe.seed, 11)))
+    return lobe._replace(light=light)
 
 
 def _under_stack(gatherer: Gatherer, points: SurfacePoints, lobes: list[Lobe], base: F32) -> F32:
@@ -96,7 +126,7 @@ def _under_stack(gatherer: Gatherer, points: SurfacePoints, lobes: list[Lobe], b
     receivers, touched = touched_receivers(gatherer.field, points)
     if len(touched):
         light = light_of_pairs(gatherer, receivers, touched, lobes, points.albedo)
-        edited[touched] = gatherer.field.finish(light, receivers)
+        edited[touched] = gatherer.field.finish(light, receivers, is_part=gatherer.is_part)
     return edited
 
 
@@ -130,6 +160,9 @@ def _reflected(gatherer: Gatherer, points: SurfacePoints, throughput: F32, seed:
     if not gatherer.follows_paths:
         assert gatherer.solution is not None
         cell = gatherer.solution.gather.locate(points)
+        if gatherer.solution.sent is not None:
+            by_group = np.take(gatherer.solution.sent, cell, axis=1) * throughput
+            return Reflected(by_group.sum(axis=0), by_group)
         by_group = np.take(gatherer.solution.b, cell, axis=1) * throughput
         return Reflected(np.take(gatherer.solution.total, cell, axis=0) * throughput, by_group)
     return reflected_radiance(
@@ -142,6 +175,7 @@ def _reflected(gatherer: Gatherer, points: SurfacePoints, throughput: F32, seed:
         seed=seed,
         light_group=gatherer.field.light_group,
         n_groups=gatherer.field.n_groups,
+        only=gatherer.lights,
     )
 
 
@@ -196,7 +230,8 @@ def _pairs(
     field = gatherer.field
     seen = np.zeros_like(brought) if gatherer.solution is None else gatherer.solution.at(casters)
     tint = np.take(lobe.tint, some // lobe.n_rays, axis=0) / np.float32(lobe.n_rays)
-    return PairLight(owner, field.casters(casters), seen, tint * brought, tint * throughput, through)
+    emitted = tint * throughput
+    return PairLight(owner, field.casters(casters), seen, tint * brought, emitted, through, gatherer.is_part)
 
 
 def _held_back(gatherer: Gatherer, lobe: Lobe, held: I64, owner: I64, slot: int) -> PairLight:

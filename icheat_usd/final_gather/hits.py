@@ -12,7 +12,7 @@ from icheat_usd.kernels.samples import cosine_rays
 from icheat_usd.kernels.transport import point_sets
 from icheat_usd.lighting import LightSampler, irradiance
 from icheat_usd.materials import effective_albedo, nonzero_rows, sample_specular, take_points
-from icheat_usd.scene import F32, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 from icheat_usd.transport import sum_groups
 
@@ -97,6 +97,7 @@ def reflected_radiance(
     seed: int,
     light_group: I64 | None = None,
     n_groups: int = 1,
+    only: Bool | None = None,
 ) -> Reflected:
     """Diffuse radiance that each point reflects, by one path per point.
 
@@ -111,6 +112,8 @@ def reflected_radiance(
         Carried into the result.
     light_group : (n_lights,), optional
         Group of each light, where there are several; paths and `total` do not depend on it.
+    only : (n_lights,) bool, optional
+        Lights whose light counts; all by default. Paths do not depend on it.
 
     Returns
     -------
@@ -128,6 +131,8 @@ def reflected_radiance(
         step_seed = int(hash_combine(seed, bounce))
         albedo = effective_albedo(points)
         per_light = irradiance(snapshot, tracer, sampler, points, step_seed, 1)
+        if only is not None:
+            per_light[~only] = 0
         received = per_light.sum(axis=0)
         result[alive] += carried * albedo * received * INVERSE_PI
         if n_groups > 1:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,12 +29,12 @@ from icheat_usd.final_gather.extras import (
     Extras,
     contribution_layers,
     covered,
-    light_layers,
     with_prefixes,
 )
 from icheat_usd.final_gather.gatherer import GatheredLight, Gatherer, GatherSolution, gathered_light
 from icheat_usd.final_gather.hits import trace_hemisphere
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, join_places, overture
+from icheat_usd.final_gather.light_parts import part_layers, with_parts
 from icheat_usd.final_gather.places import places_of
 from icheat_usd.final_gather.record_rays import HemisphereTracer
 from icheat_usd.final_gather.replay import KeptBand, Replay
@@ -77,8 +77,8 @@ class FinalGather:
     depth: F64
     contributions: Mapping[str, F64] = field(default_factory=lambda: MappingProxyType({}))
     #: what each edit adds to the edits before it, by path; if asked for
-    light_groups: Mapping[str, F64] = field(default_factory=lambda: MappingProxyType({}))
-    #: direct light of groups of lights, by name; if asked for
+    light_groups: Mapping[tuple[str, str], F64] = field(default_factory=lambda: MappingProxyType({}))
+    #: light of groups of lights, by one of `light_parts.KINDS` and the group's name; if asked for
     coverage: Mapping[str, Coverage] = field(default_factory=lambda: MappingProxyType({}))
     #: which prims ("object") and edits ("edit") the pixels show; if asked for
     replay: Replay | None = None  #: the same frame under other edits; if asked for, and only by the cached method
@@ -89,7 +89,7 @@ class _Band(NamedTuple):
 
     usual: dict[str, F64]
     contributions: dict[str, F64]
-    light_groups: dict[str, F64]
+    light_groups: dict[tuple[str, str], F64]
     coverage: dict[str, Coverage]
 
 
@@ -151,6 +151,8 @@ def final_gather(
     )
     if extras.contributions:
         gatherer = with_prefixes(gatherer)
+    if extras.indirect:
+        gatherer = with_parts(gatherer, extras.light_groups, gather_radiance)
     band = SAMPLES_AT_ONCE if is_cached else max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
     n_edge = settings.edge_samples if is_cached else 0
     camera = CameraPass(snapshot, tracer, settings, n_edge, band)
@@ -173,7 +175,7 @@ def final_gather(
     progress("gather", 1.0)
     shape = (snapshot.camera.height, snapshot.camera.width, -1)
 
-    def whole(parts: list[dict[str, F64]]) -> dict[str, F64]:
+    def whole(parts: list[dict[Any, F64]]) -> dict[Any, F64]:
         return {name: np.concatenate([part[name] for part in parts]).reshape(shape) for name in parts[0]}
 
     mattes = [part.coverage for part in bands]
@@ -201,7 +203,8 @@ def _cached(
     cells = np.concatenate([gatherer.solution.total, np.zeros((1, 3), np.float32)])
     n_theta, n_phi, own_seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(seed, 0xCAC4E))
     tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed)
-    cache = IrradianceCache(tracer, cells, settings.cache, is_kept=is_kept or not gatherer.field.is_identity)
+    keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.is_identity
+    cache = IrradianceCache(tracer, cells, settings.cache, is_kept=keeps_rays)
     found, pixel = [], []
     for _, view in camera.first():
         found.append(places_of(snapshot, gatherer.tracer, view, seed))
@@ -277,6 +280,6 @@ def _band(
     return _Band(
         usual,
         contribution_layers(gatherer.field, light, view, pixels) if extras.contributions else {},
-        light_layers(extras, gatherer.snapshot, per_light, view, pixels),
+        part_layers(extras.light_groups, gatherer.snapshot, per_light, light, view, pixels),
         covered(extras, gatherer.snapshot, gatherer.field, view, pixels),
     )

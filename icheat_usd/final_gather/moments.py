@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ def weighted_gather(moments: Iterable[tuple[float, FinalGather]]) -> FinalGather
     """
     light: dict[str, F64] = {}
     surface: dict[str, F64] = {}
-    groups: dict[str, dict[str, F64]] = {"contributions": {}, "light_groups": {}}
+    groups: dict[str, dict[Any, F64]] = {"contributions": {}, "light_groups": {}}
     coverage: dict[str, list[tuple[float, Coverage]]] = {}
     seen: F64 | None = None
     first: FinalGather | None = None
@@ -64,7 +65,7 @@ def weighted_gather(moments: Iterable[tuple[float, FinalGather]]) -> FinalGather
     )
 
 
-def _add(sums: dict[str, F64], layers: Mapping[str, F64], weight: float | F64) -> None:
+def _add(sums: dict[Any, F64], layers: Mapping[Any, F64], weight: float | F64) -> None:
     for name, values in layers.items():
         part = weight * values
         sums[name] = sums[name] + part if name in sums else part

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -14,25 +13,46 @@ from icheat_usd.final_gather import Extras, FinalGather
 from icheat_usd.image.cryptomatte import Cryptomatte, manifest, rank
 from icheat_usd.image.film import Film
 from icheat_usd.scene import F32, F64, SceneSnapshot
-from icheat_usd.session.layer_names import MATTES, SCALARS, Layer
+from icheat_usd.session.layer_names import MATTES, MEMBERS, SCALARS, Layer, channel_name
 
 #: The ratio of edited to unedited light where there was little of it: what the limit cuts off, edit_delta has.
 RATIO_LIMIT = 64.0
+
+
+#: What a layer of a light is the sum of.
+_PARTS = {
+    "light": ("seen", "direct", "indirect_edited"),
+    "light_direct": ("seen", "direct"),
+    "light_indirect": ("indirect",),
+    "light_indirect_edited": ("indirect_edited",),
+}
 
 
 @dataclass(frozen=True)
 class Scene:
     """What lights and edits are called in layers: paths by name."""
 
-    lights: Mapping[str, str]
+    lights: Mapping[str, tuple[str, ...]]  #: a group has several
     edits: Mapping[str, str]
 
 
 def layer_scene(snapshot: SceneSnapshot, stack: EditStack) -> Scene:
-    """Names for the lights of a snapshot and the active edits of a stack; two of one name are numbered."""
-    lights = tuple(dict.fromkeys(snapshot.light_paths))
+    """Names for the lights of a snapshot and the active edits of a stack; two of one name are numbered.
+
+    Lights of one tag are a group, which is called like it.
+    """
+    groups: dict[tuple[str, str], dict[str, None]] = {}
+    tags = snapshot.light_tags or ("",) * len(snapshot.light_paths)
+    for path, tag in zip(snapshot.light_paths, tags, strict=True):
+        groups.setdefault((tag, "" if tag else path), {})[path] = None
+    # A group keeps its name where a light has the same.
+    ordered = sorted(groups, key=lambda group: not group[0])
+    named = dict(zip(ordered, names_of([tag or path for tag, path in ordered]), strict=True))
     edits = tuple(edit.path for edit in stack.active)
-    return Scene(dict(zip(names_of(lights), lights, strict=True)), dict(zip(names_of(edits), edits, strict=True)))
+    return Scene(
+        {named[group]: tuple(paths) for group, paths in groups.items()},
+        dict(zip(names_of(edits), edits, strict=True)),
+    )
 
 
 def names_of(paths: Sequence[str]) -> list[str]:
@@ -40,9 +60,7 @@ def names_of(paths: Sequence[str]) -> list[str]:
     seen: dict[str, int] = {}
     names = []
     for path in paths:
-        name = re.sub(r"\W", "_", path.rpartition("/")[2], flags=re.ASCII)
-        # A layer may not end like a channel of another one, nor begin with a digit.
-        name = f"{name}_" if len(name) == 1 or name[:1].isdigit() else name
+        name = channel_name(path.rpartition("/")[2])
         seen[name] = seen.get(name, 0) + 1
         names.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
     return names
@@ -59,7 +77,8 @@ def expanded(layers: Iterable[Layer], scene: Scene) -> tuple[Layer, ...]:
     found: dict[str, Layer] = {}
     for layer in layers:
         members = [layer]
-        for family, prefix, names in (("lights", "light", scene.lights), ("edits", "edit", scene.edits)):
+        for family, prefix in MEMBERS.items():
+            names = _names(prefix, scene)
             if layer.source == family:
                 members = [Layer(f"{prefix}.{name}", f"{prefix}.{name}") for name in names]
             elif layer.source.startswith(f"{prefix}.") and layer.source.partition(".")[2] not in names:
@@ -76,13 +95,21 @@ def expanded(layers: Iterable[Layer], scene: Scene) -> tuple[Layer, ...]:
 def needed(layers: Iterable[Layer], scene: Scene) -> Extras:
     """What the final gather has to compute for expanded layers beside the usual ones."""
     sources = {layer.source for layer in layers}
-    lights = {name: (path,) for name, path in scene.lights.items() if f"light.{name}" in sources}
+    of_lights = {source.partition(".")[::2] for source in sources if source.startswith("light")}
+    wanted = {name for _, name in of_lights}
+    lights = {name: paths for name, paths in scene.lights.items() if name in wanted or "unlit" in sources}
     return Extras(
         contributions=any(source.startswith("edit.") for source in sources),
         light_groups=lights,
+        indirect="unlit" in sources or any(prefix != "light_direct" for prefix, _ in of_lights),
         objects=not sources.isdisjoint({"alpha", "crypto_object"}),
         edits="crypto_edit" in sources,
     )
+
+
+def _names(prefix: str, scene: Scene) -> Mapping[str, object]:
+    """Names of the members of a family."""
+    return scene.edits if prefix == "edit" else scene.lights
 
 
 def make_film(
@@ -106,7 +133,7 @@ def make_film(
         pixels[layer.name] = np.ascontiguousarray(values.reshape(shape), np.float32)
         family, _, name = layer.source.partition(".")
         if name:
-            about[f"layer:{layer.name}"] = (scene.lights if family == "light" else scene.edits)[name]
+            about[f"layer:{layer.name}"] = scene.edits[name] if family == "edit" else ", ".join(scene.lights[name])
     return Film(width, height, pixels, about, tuple(mattes), pixel_aspect(snapshot))
 
 
@@ -132,8 +159,10 @@ def _values(result: FinalGather, source: str, scene: Scene) -> F64:
         height, width, _ = direct.shape
         return np.bincount(covered.pixel, covered.share, height * width).astype(np.float64)
     family, _, name = source.partition(".")
-    if family == "light":
-        return result.light_groups[name]
+    if source == "unlit":
+        return result.indirect_edited - sum(result.light_groups["indirect_edited", light] for light in scene.lights)
+    if family in _PARTS:
+        return sum((result.light_groups[kind, name] for kind in _PARTS[family]), np.zeros_like(result.indirect))
     if family == "edit":
         # An edit that rests at this frame was not bound.
         return result.contributions.get(scene.edits[name], np.zeros_like(result.indirect))

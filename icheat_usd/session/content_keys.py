@@ -82,7 +82,8 @@ def snapshot_key(snapshot: SceneSnapshot, engine: str) -> str:
     tables = (snapshot.geometry, snapshot.materials, snapshot.textures, snapshot.lights, snapshot.light_paths)
     surfaces = [(s.path, s.instance_id, s.part, s.topology_digest) for s in snapshot.surfaces]
     place = (asdict(snapshot.camera), snapshot.centre, snapshot.radius)
-    return digest(_FORMAT, code_digest(), engine, tables, surfaces, snapshot.material_paths, place)
+    names = (snapshot.material_paths, snapshot.light_tags)
+    return digest(_FORMAT, code_digest(), engine, tables, surfaces, names, place)
 
 
 def _transport_settings(quality: Quality) -> tuple[Any, ...]:

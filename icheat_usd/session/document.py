@@ -205,7 +205,7 @@ class Session(ShotParts):
         Parameters
         ----------
         layers : names
-            Of `LAYERS`, `FAMILIES` or `ALIASES` in `session.layer_names`, ``light.NAME`` or ``edit.NAME``.
+            Of `LAYERS`, `FAMILIES` or `ALIASES` in `session.layer_names`, or members of a family such as ``edit.NAME``.
 
         Raises
         ------

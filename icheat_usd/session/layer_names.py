@@ -13,7 +13,7 @@ from icheat_usd.errors import ImageError
 #: What a final frame has unless something else is asked for.
 DEFAULT = ("beauty", "direct", "indirect", "indirect_edited", "edit_delta", "albedo", "normal", "depth")
 
-#: Every layer but those of single lights and edits.
+#: Every layer but those of lights and edits.
 LAYERS: Mapping[str, str] = MappingProxyType(
     {
         "beauty": "direct + indirect_edited",
@@ -24,6 +24,7 @@ LAYERS: Mapping[str, str] = MappingProxyType(
         "edit_ratio": "beauty over beauty without edits: multiply any renderer's beauty by it; 1 where nothing changes",
         "emission": "what glows in sight",
         "background": "domes in sight",
+        "unlit": "what edits add that left no light, such as emit: beauty less light.NAME of every light",
         "alpha": "share of the pixel that surfaces cover: beauty less background is premultiplied by it",
         "albedo": "diffuse reflectance",
         "normal": "world space",
@@ -33,13 +34,19 @@ LAYERS: Mapping[str, str] = MappingProxyType(
     }
 )
 
-#: Families: one layer for each light, or each edit.
+#: Families: one layer for each light or group of lights, or each edit.
 FAMILIES: Mapping[str, str] = MappingProxyType(
     {
-        "lights": "light.NAME of every light: its part of direct",
+        "lights": "light.NAME of every light or group of lights: its part of beauty; with unlit they add up to it",
+        "lights_direct": "light_direct.NAME: its part of direct",
+        "lights_indirect": "light_indirect.NAME: its part of indirect",
+        "lights_indirect_edited": "light_indirect_edited.NAME: its part of indirect_edited, again with unlit",
         "edits": "edit.NAME of every edit: they sum to edit_delta",
     }
 )
+
+#: What the layers of a family are called before the dot.
+MEMBERS: Mapping[str, str] = MappingProxyType({family: re.sub("s(_|$)", r"\1", family) for family in FAMILIES})
 
 #: Other names of `sourceName` in RenderVar prims.
 ALIASES: Mapping[str, str] = MappingProxyType(
@@ -73,8 +80,14 @@ EXPRESSIONS: Mapping[str, str] = MappingProxyType(
         "CS*[DG].+[LO]": "indirect_edited",
         "CS*[DG].+[<L.>O]": "indirect_edited",
         "CS*O": "emission",
+        "C.*<L.'NAME'>": "light.NAME",
+        "C[DS]*<L.'NAME'>": "light.NAME",
+        "CS*[DG]?<L.'NAME'>": "light_direct.NAME",
+        "CS*[DG].+<L.'NAME'>": "light_indirect_edited.NAME",
     }
 )
+
+_LIGHT = re.compile(r"<L\.'([^']+)'>")
 
 
 class MatteName(NamedTuple):
@@ -94,7 +107,7 @@ SCALARS = frozenset({"alpha", "depth"})
 class Layer:
     """A layer of a film by what it holds."""
 
-    source: str  #: name in `LAYERS`, ``light.NAME`` or ``edit.NAME``
+    source: str  #: name in `LAYERS`, or that of a member of a family, such as ``light.NAME``
     name: str  #: in the film; mattes: the type name
 
 
@@ -114,19 +127,29 @@ def canonical(source: str, kind: str = "raw", where: str = "") -> str:
     place = f"{where}: " if where else ""
     text = source.strip()
     if kind == "lpe" or text.startswith("lpe:"):
-        expression = re.sub(r"\s", "", text.removeprefix("lpe:"))
-        if expression in EXPRESSIONS:
-            return EXPRESSIONS[expression]
+        expression = re.sub(r"('[^']*')|\s", r"\1", text.removeprefix("lpe:"))
+        light = _LIGHT.search(expression)
+        layer = EXPRESSIONS.get(_LIGHT.sub("<L.'NAME'>", expression), "")
+        if layer and layer.endswith(".NAME") == (light is not None):
+            return layer if light is None else f"{layer.removesuffix('NAME')}{channel_name(light[1])}"
         known = ", ".join(f"{path} ({layer})" for path, layer in EXPRESSIONS.items())
         raise ImageError(f"{place}no layer holds exactly the light of '{source}'; there are {known}")
     if kind in ("raw", "intrinsic"):
         found = ALIASES.get(text, text)
-        if found in LAYERS or found in FAMILIES or re.match(r"(light|edit)\.\w", found):
+        family, _, name = found.partition(".")
+        if found in LAYERS or found in FAMILIES or (name and family in MEMBERS.values()):
             return found
-    names = ", ".join((*LAYERS, "light.NAME", "edit.NAME"))
+    names = ", ".join((*LAYERS, *(f"{member}.NAME" for member in MEMBERS.values())))
     aliases = ", ".join(f"{alias} = {name}" for alias, name in ALIASES.items())
     what = f"'{source}'" if kind == "raw" else f"{kind} '{source}'"
     raise ImageError(f"{place}there is no layer {what}; there are {names} ({aliases})")
+
+
+def channel_name(text: str) -> str:
+    """A text as part of a channel's name."""
+    name = re.sub(r"\W", "_", text, flags=re.ASCII)
+    # A layer may not end like a channel of another one, nor begin with a digit.
+    return f"{name}_" if len(name) == 1 or name[:1].isdigit() else name
 
 
 def n_channels(source: str) -> int:

@@ -18,7 +18,8 @@ from icheat_usd.session.shutter import moments
 if TYPE_CHECKING:
     from icheat_usd.session.document import Session
 
-_OF_EDITS = ("crypto_edit",)
+_OF_EDITS = ("crypto_edit", "unlit")
+_FAMILIES_OF_EDITS = ("edit", "light", "light_indirect_edited")
 
 
 class FrameReplay:
@@ -31,7 +32,8 @@ class FrameReplay:
     settings : GatherSettings
         Of the cached method, without denoising.
     layers : names
-        As of `Session.render`, but for what the edits contribute one by one and their mattes.
+        As of `Session.render`, but for what the edits contribute one by one, what they make of single lights, and
+        their mattes.
 
     Raises
     ------
@@ -54,7 +56,11 @@ class FrameReplay:
         sources = [layer_names.canonical(name) for name in layers]
         asked = [layer_names.Layer(source, layer_names.layer_name(source)) for source in sources]
         self._members = aovs.expanded(asked, scene)
-        refused = [m.source for m in self._members if m.source in _OF_EDITS or m.source.startswith("edit.")]
+        refused = [
+            member.source
+            for member in self._members
+            if member.source in _OF_EDITS or member.source.partition(".")[0] in _FAMILIES_OF_EDITS
+        ]
         if refused:
             raise ImageError(f"layer '{refused[0]}' cannot be replayed; render it, or leave it out")
         self._scene = scene

@@ -13,6 +13,7 @@ from icheat_usd.scene import SceneSnapshot
 from icheat_usd.stage.camera import find_camera, frame_camera, read_camera, read_render_choices
 from icheat_usd.stage.instancing import InstancerReader
 from icheat_usd.stage.light_controls import read_controls
+from icheat_usd.stage.light_tags import read_light_tags
 from icheat_usd.stage.lights import read_lights, read_mesh_factors, with_mesh_lights
 from icheat_usd.stage.materials import MaterialLibrary
 from icheat_usd.stage.opening import composition_findings, quiet_usd
@@ -137,6 +138,7 @@ def take_snapshot(
             lights=lights,
             light_paths=light_paths,
             light_controls=controls,
+            light_tags=read_light_tags([*lights_shown, *gprims], when, light_paths),
             camera=view,
             stage_path=stage.GetRootLayer().realPath or stage.GetRootLayer().identifier,
             time_code=code,

@@ -159,6 +159,7 @@ def test_the_help_lists_every_layer(capsys: pytest.CaptureFixture[str]) -> None:
 def test_layers_of_lights_and_edits_add_up(shot: Path) -> None:
     out = shot.parent / "all.exr"
     names = ["beauty", "direct", "indirect", "emission", "background", "edit_delta", "edit_ratio", "lights", "edits"]
+    names += ["lights_direct", "lights_indirect", "unlit"]
     aovs = [word for name in names for word in ("--aov", name)]
     assert (
         main(["render", str(shot), "-o", str(out), *aovs, "--aov", "crypto_object", "--aov", "crypto_edit", *QUICK])
@@ -166,9 +167,12 @@ def test_layers_of_lights_and_edits_add_up(shot: Path) -> None:
     )
     film = read_exr(out)
     layer = film.layers
-    assert set(layer) == {*names[:7], "light.Lamp", "edit.bleed"}
-    seen = layer["emission"] + layer["background"]
-    np.testing.assert_allclose(layer["light.Lamp"] + seen, layer["direct"], rtol=1e-6)
+    lit = {prefix: layer[f"{prefix}.Lamp"] for prefix in ("light", "light_direct", "light_indirect")}
+    assert set(layer) == {*names[:7], "unlit", "edit.bleed", *(f"{prefix}.Lamp" for prefix in lit)}
+    np.testing.assert_allclose(lit["light"], layer["beauty"], rtol=1e-5)
+    np.testing.assert_allclose(lit["light_direct"], layer["direct"], rtol=1e-6)
+    np.testing.assert_allclose(lit["light_indirect"], layer["indirect"], rtol=1e-5)
+    np.testing.assert_allclose(layer["unlit"], 0, atol=1e-6)
     np.testing.assert_allclose(layer["edit.bleed"], layer["edit_delta"], atol=1e-6)
     unedited = layer["direct"] + layer["indirect"]
     np.testing.assert_allclose(layer["edit_ratio"] * unedited, layer["beauty"], rtol=1e-5)

@@ -58,7 +58,7 @@ def test_an_edit_multiplies_the_denoised_image_within_its_mask() -> None:
         assert after < 0.7 * before
     changes = found.contributions["/edit"] + found.contributions["/floor_edit"]
     np.testing.assert_allclose(changes, found.indirect_edited - found.indirect, atol=1e-5)
-    np.testing.assert_allclose(found.light_groups["lamp"], found.direct, atol=1e-6)
+    np.testing.assert_allclose(found.light_groups["direct", "lamp"], found.direct, atol=1e-6)
 
 
 def test_a_gather_without_masks_is_refused() -> None:

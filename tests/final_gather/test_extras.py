@@ -73,9 +73,9 @@ def test_light_groups_add_up_to_the_direct_light() -> None:
     pipeline = Pipeline(ROOM, n_bounces=1)
     found = pipeline.final(**QUICK, extras=Extras(light_groups={"key": (key,), "fill": (fill,), "both": (key, fill)}))
     groups = found.light_groups
-    np.testing.assert_allclose(groups["key"] + groups["fill"], found.direct, rtol=1e-5, atol=1e-7)
-    np.testing.assert_array_equal(groups["both"], found.direct)
-    assert groups["key"][..., 0].mean() > 2 * groups["fill"][..., 0].mean() > 0
+    np.testing.assert_allclose(groups["direct", "key"] + groups["direct", "fill"], found.direct, rtol=1e-5, atol=1e-7)
+    np.testing.assert_array_equal(groups["direct", "both"], found.direct)
+    assert groups["direct", "key"][..., 0].mean() > 2 * groups["direct", "fill"][..., 0].mean() > 0
 
 
 def test_without_edits_there_is_nothing_to_contribute() -> None:

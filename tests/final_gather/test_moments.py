@@ -18,7 +18,7 @@ def image(value: float, depth: float, **more: object) -> FinalGather:
 
 
 def test_light_is_the_weighted_mean_and_surfaces_count_where_they_are_seen() -> None:
-    here = {"contributions": {"/a": np.full((1, 2, 3), 8.0)}, "light_groups": {"key": np.ones((1, 2, 3))}}
+    here = {"contributions": {"/a": np.full((1, 2, 3), 8.0)}, "light_groups": {("direct", "key"): np.ones((1, 2, 3))}}
     covered = coverage(np.array([0]), np.array([7], np.uint32), np.array([1.0]))
     parts = [(0.25, image(4.0, 2.0, coverage={"object": covered}, **here)), (0.75, image(8.0, 0.0))]
     found = weighted_gather(iter(parts))
@@ -29,7 +29,7 @@ def test_light_is_the_weighted_mean_and_surfaces_count_where_they_are_seen() -> 
     np.testing.assert_allclose(found.albedo[..., 0], [[2.0, 0.0]])
     # An edit and a light that are there for a part of the time.
     np.testing.assert_allclose(found.contributions["/a"], 2.0)
-    np.testing.assert_allclose(found.light_groups["key"], 0.25)
+    np.testing.assert_allclose(found.light_groups["direct", "key"], 0.25)
     assert found.coverage["object"].share.tolist() == [0.25]
 
 

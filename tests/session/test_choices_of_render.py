@@ -11,6 +11,7 @@ import pytest
 from icheat_usd.errors import ImageError
 from icheat_usd.resources import resource_path
 from icheat_usd.session import GatherSettings, Quality, Session
+from icheat_usd.session.layer_names import DEFAULT
 
 BOX = resource_path("sample_stages/cornell_box/shot.usda")
 EFFORT = GatherSettings(samples_per_pixel=2, edge_samples=0)
@@ -33,13 +34,18 @@ def test_photons_give_the_light_that_the_cells_give(session: Session) -> None:
 
 def test_a_denoised_frame_keeps_what_no_edit_touches(session: Session) -> None:
     pytest.importorskip("pyoidn")
-    plain, clean = (session.render(replace(EFFORT, denoise=denoise)) for denoise in (False, True))
+    layers = (*DEFAULT, "lights_indirect", "lights_indirect_edited")
+    plain, clean = (session.render(replace(EFFORT, denoise=denoise), layers) for denoise in (False, True))
     untouched = ~plain.layer("edit_delta").any(axis=2)
     assert 20 < untouched.sum() < untouched.size - 20
     np.testing.assert_array_equal(clean.layer("indirect_edited")[untouched], clean.layer("indirect")[untouched])
     for layer in ("direct", "indirect", "indirect_edited", "beauty"):
         assert not np.array_equal(plain.layer(layer), clean.layer(layer))
         assert clean.layer(layer).mean() == pytest.approx(plain.layer(layer).mean(), rel=0.05)
+    # The only light has all of it.
+    (lamp,) = (name.partition(".")[2] for name in clean.layers if name.startswith("light_indirect."))
+    for layer in ("indirect", "indirect_edited"):
+        np.testing.assert_allclose(clean.layer(f"light_{layer}.{lamp}"), clean.layer(layer), rtol=1e-5, atol=1e-7)
 
 
 def test_the_denoiser_is_missed_before_the_work(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
