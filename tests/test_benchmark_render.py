@@ -6,14 +6,19 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tools.benchmarking import rival_summary
+from tools.benchmarking.goals import Goal, at_least, at_most
+from tools.benchmarking.mitsuba_layers import MitsubaLayers
+from tools.benchmarking.references import Reference
 from tools.benchmarking.render_sequence import flicker
 from tools.benchmarking.rival_errors import squared_errors, trimmed_rel_mse
+from tools.benchmarking.rival_scenes import rival_scene
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -55,13 +60,17 @@ def test_suites_of_the_final_gather_report(tmp_path: Path) -> None:
     assert properties["bits"]["same_bits"]
     assert properties["offset"]["mean"] == pytest.approx(0.70, rel=1e-4)
     assert properties["edge"]["pixels"] > 10
-    assert {point["what"] for point in results["scale"]} == {"triangles", "lights", "pixels"}
+    assert {point["what"] for point in results["scale"]} == {"triangles", "lights", "pixels", "stage"}
     assert all(one["touched_share"] > 0 for one in results["sequence"])
     killed = results["killed"][0]
-    assert killed["same_pixels"] == killed["frames"] == 2 and killed["half_written"] == 0
+    assert killed["same_pixels"] == killed["same_files"] == killed["frames"] == 2 and killed["half_written"] == 0
+    assert [kill["status"] for kill in killed["kills"] if kill["while_writing"]] == [-9]
+    assert not killed["left_behind"]
+    for one in results["sequence"]:
+        assert {one["sheet"], one["slice"]} <= {path.name for path in (tmp_path / "images" / "sequence").iterdir()}
     text = (tmp_path / "report.md").read_text()
     assert all(f"### {name}" in text for name in results)
-    assert "failed" not in text
+    assert "failed" not in text and text.count("Goal, ") >= 6
 
 
 def test_errors_do_not_hold_the_noise_of_the_reference() -> None:
@@ -98,6 +107,39 @@ def test_curves_are_compared_at_equal_time() -> None:
     assert over["1"] == pytest.approx(0.005 / 0.01)
     # Between 1 s and 16 s on a straight line in the logarithms, past the point that is worse than a quicker one.
     assert over["4"] == pytest.approx(np.sqrt(0.005 * 0.001) / 0.0025)
+
+
+def test_goals_say_what_was_met_and_what_was_missed() -> None:
+    goals = [Goal("1 edit", 1.02, 1.05), Goal("8 edits", 1.4, 1.1)]
+    assert at_most("time", goals) == "Goal, time at most 1.05 / 1.1; met: 1 edit 1.02; missed: 8 edits 1.4."
+    assert at_least("speed", goals) == "Goal, speed at least 1.05 / 1.1; met: 8 edits 1.4; missed: 1 edit 1.02."
+    assert at_most("time", []).endswith("not measured.")
+
+
+def test_noise_of_a_reference_with_and_without_its_fireflies() -> None:
+    rng = np.random.default_rng(3)
+    halves = [1 + 0.1 * rng.normal(size=(60, 80, 3)) for _ in range(2)]
+    bright = halves[0].copy()
+    bright[7, 9] += 50
+    found = Reference((bright, halves[1]), (bright, halves[1]), 16, 1.0)
+    assert found.noise(0.001) == pytest.approx(0.1**2 / 2, rel=0.05)
+    assert found.noise() > 10 * found.noise(0.001)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_what_is_subtracted_has_the_same_random_numbers(variant: str) -> None:
+    """Nearly black surfaces send nearly nothing but direct light, and so does what is left without it."""
+    pytest.importorskip("mitsuba")
+    scene = rival_scene(REPOSITORY / "sample_stages/cornell_box/scene.usda", 16, 12).snapshot
+    black = np.full_like(scene.materials.diffuse, 1e-4)
+    dark = replace(
+        scene,
+        materials=scene.materials._replace(diffuse=black, use_display_color=0 * scene.materials.use_display_color),
+    )
+    layers = MitsubaLayers(dark, 18, "fast" if variant.startswith("llvm") else variant)
+    found = layers.layers(min(layers.most_samples, 64), 5)
+    assert found.whole.mean() > 0
+    assert np.abs(found.indirect).mean() < 0.01 * found.whole.mean()
 
 
 def test_flicker_is_nothing_where_light_changes_evenly() -> None:

@@ -15,6 +15,11 @@ _ROULETTE = 5
 _PATHS_AT_ONCE = 5_000_000
 
 
+def _samples_at_once(variant: str, n_pixels: int) -> int:
+    """One where a pixel's samples share one stream of random numbers: after the first, shorter paths get others."""
+    return max(1, _PATHS_AT_ONCE // n_pixels) if variant.startswith("llvm") else 1
+
+
 class Layers(NamedTuple):
     """One render."""
 
@@ -35,7 +40,7 @@ class MitsubaLayers:
         self.mi: Any = peer.load(variant)
         self.variant: str = self.mi.variant()
         self.snapshot = snapshot
-        self.most_samples = max(1, _PATHS_AT_ONCE // (snapshot.camera.width * snapshot.camera.height))
+        self.most_samples = _samples_at_once(self.variant, snapshot.camera.width * snapshot.camera.height)
         self._scene = peer.mitsuba_scene(self.mi, snapshot)
         self._depth = depth
 

@@ -8,7 +8,7 @@ from typing import Any
 import matplotlib
 
 matplotlib.use("Agg")
-from matplotlib import pyplot  # noqa: E402
+from matplotlib import pyplot, ticker  # noqa: E402
 
 from tools.benchmarking.growth import points_of  # noqa: E402
 
@@ -63,6 +63,9 @@ def _growth(results: list[dict[str, Any]], path: Path) -> bool:
             axes.plot(sizes, [value / values[0] for value in values], "o-", label=name)
         axes.set_title(kind, fontsize=9)
         axes.set_ylim(bottom=0)
+        # 1,000,000 beside 1,050,000 would be one black bar.
+        axes.xaxis.set_major_locator(ticker.MaxNLocator(4))
+        axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
         axes.grid(alpha=0.3)
     all_axes[0][0].set_ylabel("over that of the smallest")
     all_axes[0][0].legend(fontsize=7)

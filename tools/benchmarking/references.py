@@ -30,10 +30,18 @@ class Reference:
     samples: int  #: per pixel, of each half
     seconds: float  #: that rendering both took
 
-    def noise(self) -> float:
-        """Relative mean square of the noise of the mean of the indirect halves."""
+    def noise(self, trimmed: float = 0.0) -> float:
+        """Relative mean square of the noise of the mean of the indirect halves.
+
+        Parameters
+        ----------
+        trimmed
+            Share of the pixels, those with the most noise, that is left out.
+        """
         a, b = self.indirect
-        return float((((a - b) / 2) ** 2).mean() / max((a * b).mean(), 1e-30))
+        squares = np.sort((((a - b) / 2) ** 2).mean(axis=2), axis=None)
+        kept = len(squares) - int(np.ceil(trimmed * len(squares)))
+        return float(squares[:kept].sum() / len(squares) / max((a * b).mean(), 1e-30))
 
 
 def default_folder() -> Path:

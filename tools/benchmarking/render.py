@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 
 from tools.benchmarking.runner import ROOT, Benchmark, add_common_arguments, run_benchmark, work
 
@@ -38,12 +39,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--renderers", metavar="NAME,...", help="rivals: some of ours,llvm,scalar,luxcore; default all of them"
     )
+    parser.add_argument(
+        "--efforts", metavar="NAME,...", help="rivals: some of ours, as 'cached 0,cached 3'; default all of them"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """The whole benchmark, or one case of it in a worker."""
     if arguments.worker:
         return work(BENCHMARK, json.loads(arguments.worker))
+    unknown = _unknown(arguments)
+    if unknown:
+        print(unknown, file=sys.stderr)
+        return 2
     stages = arguments.stages or [str(ROOT / name) for name in _STAGES[: 1 if arguments.quick else None]]
     effort = {"width": arguments.width, "height": arguments.height}
     if arguments.quick:
@@ -53,5 +61,19 @@ def run(arguments: argparse.Namespace) -> int:
         "reference_minutes": arguments.reference_minutes,
         "seconds": 0.2 if arguments.quick else arguments.seconds,
         "renderers": arguments.renderers,
+        "efforts": arguments.efforts,
     }
     return run_benchmark(BENCHMARK, arguments, stages, effort, options)
+
+
+def _unknown(arguments: argparse.Namespace) -> str | None:
+    """What is wrong with the names of renderers and efforts."""
+    from tools.benchmarking.render_efforts import efforts
+    from tools.benchmarking.rivals import RENDERERS
+
+    known = {"renderers": RENDERERS, "efforts": tuple(efforts(arguments.quick))}
+    for option, names in known.items():
+        wrong = [name for name in (getattr(arguments, option) or names[0]).split(",") if name not in names]
+        if wrong:
+            return f"--{option}: there is no {', '.join(wrong)}; there are {', '.join(names)}"
+    return None

@@ -22,9 +22,10 @@ from icheat_usd.final_gather.hits import trace_hemisphere
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F64, I32
 from icheat_usd.stage import open_stage, take_snapshot
+from tools.benchmarking.goals import Goal, at_least, at_most
 from tools.benchmarking.made_up_edits import one_edit, painted
 from tools.benchmarking.parts import Effort
-from tools.benchmarking.render_efforts import usual
+from tools.benchmarking.render_efforts import edited
 from tools.benchmarking.render_frame import Frame, replay, warm
 
 #: Least share of the view, and of the hits, that edits act on.
@@ -32,7 +33,11 @@ LEAST_SHARE = 0.3
 
 ENCODINGS = ("object", "brush", "vector", "recipe", "rows")
 _COUNTS, _QUICK_COUNTS = (1, 8, 64), (1, 3)
-_ROUNDS, _QUICK_ROUNDS = 5, 1
+_ROUNDS, _QUICK_ROUNDS = 4, 1
+
+#: Times of none that edits may take, by how many; one of sampled rows has a bound of its own. And how much faster a
+#: replay is to be than the render.
+_GOALS, _ROWS_GOALS, _REPLAY_GOAL = {"1": 1.05, "8": 1.10, "64": 1.35}, {"1": 1.15}, 20.0
 _BAKED = 8  #: different rows; more edits than that share them
 _PILOT = 8192  #: places of the view that shares of hits are found from
 
@@ -53,7 +58,7 @@ def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
     """Median times by number of edits, and their ratios to none."""
     snapshot = take_snapshot(open_stage(case["stage"]), width=effort.width, height=effort.height)
-    frame = Frame(snapshot, usual(quick))
+    frame = Frame(snapshot, edited(quick))
     shares = shares_of(frame)
     stacks = {"none": EMPTY_STACK}
     for n in _QUICK_COUNTS if quick else _COUNTS:
@@ -61,7 +66,9 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     if case["encoding"] != "rows":
         most = (_QUICK_COUNTS if quick else _COUNTS)[-1]
         stacks[f"{most} apart"] = stack_of(frame, shares, case["encoding"], most, apart=True)
-    warm(snapshot, usual(quick), stacks["1"])
+    for stack in stacks.values():
+        warm(snapshot, edited(quick), stack)
+    _ = frame.cell_radiance
     times = interleaved(frame, stacks, _QUICK_ROUNDS if quick else _ROUNDS)
     none = statistics.median(times["none"])
     found = {
@@ -78,14 +85,13 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
 
 
 def interleaved(frame: Frame, stacks: dict[str, EditStack], rounds: int) -> dict[str, list[float]]:
-    """Times of each stack, one after the other in every round; a first round is left out."""
+    """Times of each stack, one after the other in every round."""
     times: dict[str, list[float]] = {name: [] for name in stacks}
-    for round_ in range(rounds + 1):
+    for _ in range(rounds):
         for name, stack in stacks.items():
             start = time.perf_counter()
             frame.render(frame.field(stack))
-            if round_:
-                times[name].append(time.perf_counter() - start)
+            times[name].append(time.perf_counter() - start)
     return times
 
 
@@ -225,4 +231,25 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
         " the render."
         for one in replays
     ]
-    return lines
+    return [*lines, "", *_goals(done)]
+
+
+def _goals(done: list[dict[str, Any]]) -> list[str]:
+    """Every encoding beside its bounds; recipes gather rays of their own and have none."""
+    ratios, replays = [], []
+    for one in done:
+        encoding, result = one["case"]["encoding"], one["result"]
+        bounds = {"rows": _ROWS_GOALS, "recipe": {}}.get(encoding, _GOALS)
+        label = f"{one['case']['name']} {encoding}"
+        ratios += [
+            Goal(f"{n} {label}", result["times"][n]["ratio"], bound)
+            for n, bound in bounds.items()
+            if n in result["times"]
+        ]
+        if result["replay"]:
+            replays.append(Goal(label, result["replay"]["times_render"], _REPLAY_GOAL))
+    return [
+        at_most("time with 1 / 8 / 64 edits over that with none (one of rows: 1.15),", ratios),
+        "",
+        at_least("times that a replay is faster than the render,", replays),
+    ]

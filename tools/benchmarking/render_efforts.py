@@ -52,8 +52,8 @@ EFFORTS: dict[str, RenderEffort] = {
     ),
 }
 
-#: What is measured where one effort must do: cost of edits, growth.
-USUAL = "cached 3"
+#: What is measured where one effort must do, and the lesser one for the cost of edits, which takes many renders.
+USUAL, EDITED = "cached 3", "cached 2"
 
 _LEAST = replace(PREVIEW, n_gather=512, rays_per_bounce_row=16, light_samples=2)
 
@@ -72,3 +72,8 @@ def efforts(quick: bool) -> dict[str, RenderEffort]:
 def usual(quick: bool) -> RenderEffort:
     """The one where one must do."""
     return QUICK["cached"] if quick else EFFORTS[USUAL]
+
+
+def edited(quick: bool) -> RenderEffort:
+    """The one that costs of edits are measured with."""
+    return QUICK["cached"] if quick else EFFORTS[EDITED]

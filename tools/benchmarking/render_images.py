@@ -8,17 +8,21 @@ import numpy as np
 
 from icheat_usd.image.png import encode_png
 from icheat_usd.scene import F32, F64, U8
+from tools.benchmarking.statistics import smoothed
 
 #: Relative error that is shown as full red (too bright) or full blue (too dark).
 _FULL = 0.25
 
 
 def write_sheet(path: Path, image: F64, reference: F64) -> str:
-    """Reference, image and signed relative difference side by side; (height, width, 3) scene-linear."""
+    """Reference, image and signed relative difference side by side; (height, width, 3) scene-linear.
+
+    The difference is smoothed over 5 x 5 pixels: the reference's noise would hide blotches.
+    """
     mean = float(reference.mean()) or 1.0
     gap = np.full((image.shape[0], 4, 3), 255, np.uint8)
-    off = ((image - reference) / (reference + 0.1 * mean)).mean(axis=2)
-    sheet = [_as_light(reference / mean), gap, _as_light(image / mean), gap, _signed(off)]
+    off = smoothed(image - reference) / (smoothed(reference) + 0.1 * mean)
+    sheet = [_as_light(reference / mean), gap, _as_light(image / mean), gap, _signed(off.mean(axis=2))]
     return write_png(path, np.concatenate(sheet, axis=1))
 
 

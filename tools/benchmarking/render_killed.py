@@ -1,4 +1,7 @@
-"""Suite `killed`: a sequence whose process is killed at random and started again has the frames of one left alone."""
+"""Suite `killed`: a sequence whose process is killed and started again has the frames of one left alone.
+
+Ten times it is killed at random, and then as often as given while a file is being written, which chance rarely meets.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +23,14 @@ from tools.benchmarking.parts import Effort
 from tools.benchmarking.render_sequence import STAGE
 from tools.benchmarking.runner import ROOT
 
-_FRAMES, _QUICK_FRAMES = 12, 2
+_FRAMES, _QUICK_FRAMES = 16, 2
 _KILLS, _QUICK_KILLS = 10, 1
-_SIZE, _QUICK_SIZE = (320, 240), (12, 9)
+_WHILE_WRITING = 3
+_SIZE, _QUICK_SIZE = (160, 120), (12, 9)
+
+#: When a process is killed at random, as shares of what the whole sequence takes: much later, and nothing would be
+#: left to kill at the end.
+_EARLIEST, _LATEST = 0.02, 0.18
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
@@ -39,7 +47,10 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         start = time.perf_counter()
         _run(case["stage"], alone, quick).wait()
         whole = time.perf_counter() - start
-        kills = [_kill_one(case["stage"], killed, quick, i, whole) for i in range(_QUICK_KILLS if quick else _KILLS)]
+        rng = np.random.default_rng(0x51)
+        delays = rng.uniform(_EARLIEST, _LATEST, _QUICK_KILLS if quick else _KILLS) * whole
+        kills = [_kill_one(case["stage"], killed, quick, float(delay)) for delay in delays]
+        kills += [_kill_one(case["stage"], killed, quick, None) for _ in range(1 if quick else _WHILE_WRITING)]
         start = time.perf_counter()
         status = _run(case["stage"], killed, quick).wait()
         frames = {name: _pixels(killed / name) == _pixels(alone / name) for name in _names(quick)}
@@ -63,29 +74,33 @@ def _names(quick: bool) -> list[str]:
 
 
 def _run(stage: str, folder: Path, quick: bool) -> subprocess.Popen[bytes]:
+    """As a user starts it, at full effort; a quick one by brute force, which has less to load."""
     width, height = _QUICK_SIZE if quick else _SIZE
     command = [sys.executable, "-m", "icheat_usd", "render", stage, "--frames", f"1:{len(_names(quick))}"]
-    command += ["--width", str(width), "--height", str(height), "--method", "brute", "--samples", "1"]
-    command += ["--rays", "16", "-o", str(folder / "frame.####.exr")]
+    command += ["--width", str(width), "--height", str(height), "-o", str(folder / "frame.####.exr")]
+    command += ["--method", "brute", "--samples", "1", "--rays", "16"] if quick else ["--method", "cached"]
     output = subprocess.DEVNULL
     return subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output, start_new_session=True)
 
 
-def _kill_one(stage: str, folder: Path, quick: bool, number: int, whole: float) -> dict[str, Any]:
-    """Start, kill after a random part of what a whole run takes, and look at what is there."""
+def _kill_one(stage: str, folder: Path, quick: bool, delay: float | None) -> dict[str, Any]:
+    """Start, kill after so many seconds, or once a file is being written, and look at what is there."""
     before = {path.name: path.stat().st_mtime_ns for path in folder.glob("frame.*.exr")}
-    rng = np.random.default_rng([number, 0x51])
-    # Beyond a third nothing would be left for the last of ten.
-    delay = float(rng.uniform(0.05, 0.35)) * whole
+    others = {path.name for path in folder.iterdir()}
+    start = time.perf_counter()
     process = _run(stage, folder, quick)
-    try:
-        process.wait(delay)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    while process.poll() is None:
+        is_writing = any(path.name not in others for path in folder.iterdir())
+        if is_writing if delay is None else time.perf_counter() - start >= delay:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        elif delay is not None:
+            time.sleep(0.002)
     there = sorted(folder.glob("frame.*.exr"))
     return {
-        "after_seconds": delay,
+        "after_seconds": time.perf_counter() - start,
+        "while_writing": delay is None,
+        "partial": [path.name for path in folder.iterdir() if path.name not in _names(quick)],
         "status": process.returncode,
         "there": len(there),
         "unreadable": [path.name for path in there if _pixels(path) is None],
@@ -113,13 +128,18 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
     """A sentence for README."""
     lines = []
     for found in (one["result"] for one in results if "result" in one):
-        n_killed = sum(kill["status"] < 0 for kill in found["kills"])
+        at_random = [kill for kill in found["kills"] if not kill["while_writing"]]
+        n_killed, n_writing = (
+            sum(kill["status"] < 0 for kill in found["kills"] if kill["while_writing"] is writing)
+            for writing in (False, True)
+        )
         lines.append(
-            f"Killed {n_killed} times of {len(found['kills'])} starts (the others had ended); afterwards"
-            f" {found['same_pixels']} of {found['frames']} frames have the pixels of an undisturbed run"
-            f" ({found['same_files']} the same files), {found['half_written']} half-written frames were seen,"
-            f" {found['done_again']} finished ones were rendered again, left behind:"
-            f" {', '.join(found['left_behind']) or 'nothing'}. Alone {found['seconds_alone']:.1f} s, the last start"
-            f" {found['seconds_last']:.1f} s."
+            f"Killed {n_killed} times at random in {len(at_random)} starts (in the others the sequence had ended), and"
+            f" {n_writing} times while a frame was being written. Afterwards {found['same_pixels']} of"
+            f" {found['frames']} frames have the pixels of an undisturbed run ({found['same_files']} are the same"
+            f" files). Seen on the way: {found['half_written']} frames that could not be read,"
+            f" {found['done_again']} finished ones that were rendered again. Left behind:"
+            f" {', '.join(found['left_behind']) or 'nothing'}. The undisturbed run took {found['seconds_alone']:.1f} s,"
+            f" the last start {found['seconds_last']:.1f} s."
         )
     return lines

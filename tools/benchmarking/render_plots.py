@@ -8,7 +8,7 @@ from typing import Any
 import matplotlib
 
 matplotlib.use("Agg")
-from matplotlib import pyplot  # noqa: E402
+from matplotlib import pyplot, ticker  # noqa: E402
 
 from tools.benchmarking.rival_summary import curves_of  # noqa: E402
 
@@ -26,6 +26,7 @@ def plot(report: dict[str, Any], folder: Path) -> list[Path]:
         written.append(folder / f"rivals_{stage}.png")
         _rivals(stage, curves, written[-1])
     points = [one["result"] for one in report["suites"].get("scale", []) if "result" in one]
+    points = [point for point in points if point["what"] != "stage"]
     if points:
         written.append(folder / "scale.png")
         _scale(points, written[-1])
@@ -41,6 +42,7 @@ def _rivals(stage: str, curves: dict[str, list[dict[str, Any]]], path: Path) -> 
             if shown:
                 axes.loglog(*zip(*shown, strict=True), "o-", label=name, markersize=3, lw=2 if name == "ours" else 1)
         axes.set_xlabel("seconds")
+        _plain_numbers(axes.xaxis)
         axes.set_title(label, fontsize=9)
         axes.grid(alpha=0.3, which="both")
     all_axes[0].legend(fontsize=7)
@@ -59,9 +61,21 @@ def _scale(points: list[dict[str, Any]], path: Path) -> None:
         axes.loglog(sizes, [point["load_seconds"] for point in some], "o-", label="load, s")
         axes.loglog(sizes, [point["peak_mib"] / 1024 for point in some], "o--", label="peak memory, GiB")
         axes.set_title(kind, fontsize=9)
-        axes.grid(alpha=0.3, which="both")
+        axes.set_xticks(sizes)
+        axes.xaxis.set_minor_locator(ticker.NullLocator())
+        axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
+        _plain_numbers(axes.yaxis)
+        axes.tick_params(labelsize=8)
+        axes.grid(alpha=0.3)
     all_axes[0][0].legend(fontsize=7)
     _save(figure, path)
+
+
+def _plain_numbers(axis: Any) -> None:
+    """0.5, 1, 2, 5, 10 in place of powers."""
+    axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(ticker.NullFormatter())
 
 
 def _save(figure: Any, path: Path) -> None:

@@ -26,6 +26,7 @@ from icheat_usd.samples.develop import average
 from icheat_usd.scene import F32, F64, Bool, SceneSnapshot
 from icheat_usd.stage import open_stage, take_snapshot
 from tools.benchmarking.generated import WALL_ALBEDO, WALL_AREA, WALL_COSINE, write_screened
+from tools.benchmarking.goals import Goal, at_most
 from tools.benchmarking.parts import Effort
 from tools.benchmarking.render_edits import shares_of
 from tools.benchmarking.render_efforts import RenderEffort, usual
@@ -213,7 +214,8 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
                 f" {100 * unedited['rms']:.2f} ± {100 * unedited['standard_error']:.2f} % |"
                 f" {100 * crossed['rms']:.2f} ± {100 * crossed['standard_error']:.2f} % |"
             )
-        lines.append("")
+        errors = [Goal(f"{name}:", 100 * edge[name]["edited"]["rms"], 1.0) for name in ("from all", "from one caster")]
+        lines += ["", at_most("% beside a hard edge", errors), ""]
     if "offset" in found:
         offset = found["offset"][1]
         lines.append(

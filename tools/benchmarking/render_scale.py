@@ -1,6 +1,6 @@
-"""Suite `scale`: how time and memory of a frame grow with triangles, lights and pixels.
+"""Suite `scale`: how time and memory of a frame grow with triangles, lights and pixels, and what named stages take.
 
-Every size has a process of its own. Loading is the stage's snapshot and the tracer, rendering all the rest.
+Every size and stage has a process of its own. Loading is the stage's snapshot and the tracer, rendering all the rest.
 """
 
 from __future__ import annotations
@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pxr import Usd, UsdGeom
 
 from icheat_usd.scene import LightKind, SceneSnapshot
 from icheat_usd.stage import open_stage, take_snapshot
 from tools.benchmarking.generated import write_room
+from tools.benchmarking.goals import Goal, at_most
 from tools.benchmarking.meter import PeakMemory
 from tools.benchmarking.parts import Effort
 from tools.benchmarking.render_efforts import usual
 from tools.benchmarking.render_frame import Frame, warm
-from tools.benchmarking.test_lights import TestLight, with_lights
+from tools.benchmarking.test_lights import TestLight, add_lights, with_lights
 
 _TRIANGLES, _QUICK_TRIANGLES = (10_000, 100_000, 1_000_000), (100, 400)
 _LIGHTS, _QUICK_LIGHTS = (1, 4, 16, 64), (1, 3)
@@ -30,15 +32,16 @@ _USUAL_TRIANGLES = 100_000
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
-    """All of the generated room; stages are named for the report alone."""
+    """Sizes of the generated room, and every stage as it is."""
     sizes = {
         "triangles": _QUICK_TRIANGLES if quick else _TRIANGLES,
         "lights": _QUICK_LIGHTS if quick else _LIGHTS,
         "pixels": _QUICK_WIDTHS if quick else _WIDTHS,
     }
-    return [
+    of_room = [
         {"stage": "generated room", "what": what, "size": size} for what, values in sizes.items() for size in values
     ]
+    return of_room + [{"stage": stage, "what": "stage", "size": 0} for stage in stages]
 
 
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
@@ -50,8 +53,8 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     with tempfile.TemporaryDirectory() as scratch:
         n_triangles = size if what == "triangles" else (400 if quick else _USUAL_TRIANGLES)
         small = write_room(Path(scratch) / "small.usda", 200)
-        warm(_snapshot(small, 32, 24, case), usual(quick))
-        stage = write_room(Path(scratch) / "room.usda", n_triangles)
+        stage = Path(case["stage"]) if what == "stage" else write_room(Path(scratch) / "room.usda", n_triangles)
+        warm(_snapshot(stage if what == "stage" else small, 32, 24, case), usual(quick))
         peak, start = PeakMemory(), time.perf_counter()
         snapshot = _snapshot(stage, width, height, case)
     frame = Frame(snapshot, usual(quick))
@@ -61,7 +64,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     found = {
         "what": what,
         "size": width * height if what == "pixels" else size,
-        "named": f"{width}x{height}" if what == "pixels" else f"{size:,}",
+        "named": {"pixels": f"{width}x{height} pixels", "stage": case["name"]}.get(what, f"{size:,} {what}"),
         "load_seconds": load_seconds,
         "render_seconds": seconds,
         "cell_seconds": frame.light_seconds,
@@ -77,8 +80,21 @@ def _height(width: int) -> int:
 
 
 def _snapshot(stage: Path, width: int, height: int, case: dict[str, Any]) -> SceneSnapshot:
-    snapshot = take_snapshot(open_stage(stage), width=width, height=height)
+    opened = open_stage(stage)
+    if case["what"] == "stage":
+        return _seen_and_lit(opened, width, height)
+    snapshot = take_snapshot(opened, width=width, height=height)
     return _lit(snapshot, case["size"]) if case["what"] == "lights" else snapshot
+
+
+def _seen_and_lit(stage: Usd.Stage, width: int, height: int) -> SceneSnapshot:
+    """A stage as it is; one without a camera is framed, one without a light gets a grey sky."""
+    has_camera = any(prim.IsA(UsdGeom.Camera) for prim in stage.Traverse())
+    snapshot = take_snapshot(stage, camera=None if has_camera else "auto", width=width, height=height)
+    if len(snapshot.lights.kind):
+        return snapshot
+    grey = np.ones((2, 4, 3), np.float32)
+    return add_lights(snapshot, [TestLight("sky", LightKind.DOME, np.eye(3, 4), (1.0, 1.0, 1.0), image=grey)])
 
 
 def _lit(snapshot: SceneSnapshot, n: int) -> SceneSnapshot:
@@ -100,7 +116,10 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
     lines.append("| --- | ---: | ---: | ---: | ---: |")
     for point in (one["result"] for one in results if "result" in one):
         lines.append(
-            f"| {point['named']} {point['what']} | {point['load_seconds']:.2f} s | {point['render_seconds']:.2f} s |"
+            f"| {point['named']} | {point['load_seconds']:.2f} s | {point['render_seconds']:.2f} s |"
             f" {point['cell_seconds']:.2f} s | {point['peak_mib'] / 1024:.2f} GiB |"
         )
-    return lines
+    peaks = [
+        Goal(f"{one['named']}", one["peak_mib"] / 1024, 8) for one in (o["result"] for o in results if "result" in o)
+    ]
+    return [*lines, "", at_most("peak memory in GiB", peaks)]

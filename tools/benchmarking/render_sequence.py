@@ -1,7 +1,8 @@
 """Suite `sequence`: frames of an animated stage with keyed edits, and whether they flicker.
 
 Flicker is what a pixel does beside moving evenly: the root mean square of its second difference over frames, of the
-logarithm of the light, with edits and without, from the same renders. What moves in the picture is in both.
+logarithm of the light, with edits and without, from the same renders. What moves in the picture is in both. To look
+at there are a sheet of the frames, and a slice: one row of pixels of every frame, in which flicker is stripes.
 """
 
 from __future__ import annotations
@@ -19,31 +20,35 @@ from icheat_usd.image.contact import contact_sheet
 from icheat_usd.scene import F32, F64
 from icheat_usd.session import Session
 from icheat_usd.stage import open_stage
+from tools.benchmarking.goals import Goal, at_most
 from tools.benchmarking.parts import Effort
 from tools.benchmarking.render_efforts import usual
 from tools.benchmarking.render_images import as_bytes, write_png
 from tools.benchmarking.runner import ROOT
 
 STAGE = "sample_stages/animated_room/sequence.usda"
+ONE_SEED, SEED_A_FRAME = "one seed", "a seed a frame"  #: the first is what `icheat render` does
 _FRAMES, _QUICK_FRAMES = 48, 4
+_FEWER = 12  #: frames, where every frame has a seed of its own
+_SLICE = 6  #: rows of a slice for one frame
 _SIZE, _QUICK_SIZE = (160, 120), (16, 12)
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
     """The animated sample stage, whatever stages are named."""
-    return [{"stage": str(ROOT / STAGE), "seeds": seeds} for seeds in ("one seed", "a seed a frame")]
+    return [{"stage": str(ROOT / STAGE), "seeds": seeds} for seeds in (ONE_SEED, SEED_A_FRAME)]
 
 
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
     """Second differences of the indirect light with edits and without, and a contact sheet of all frames."""
     width, height = _QUICK_SIZE if quick else _SIZE
-    n = _QUICK_FRAMES if quick else _FRAMES
+    n = _QUICK_FRAMES if quick else (_FRAMES if case["seeds"] == ONE_SEED else _FEWER)
     chosen = usual(quick)
     stage = open_stage(case["stage"])
     frames: list[dict[str, F32]] = []
     start = time.perf_counter()
     for frame in range(1, n + 1):
-        seed = frame if case["seeds"] == "a seed a frame" else 0
+        seed = frame if case["seeds"] == SEED_A_FRAME else 0
         quality, settings = replace(chosen.quality, seed=seed), replace(chosen.settings, seed=seed)
         session = Session.open(stage, frame=float(frame), width=width, height=height, quality=quality)
         film = session.render(settings)
@@ -63,6 +68,8 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         "sheet": write_png(folder / "sequence" / f"sheet_{name}.png", as_bytes(contact_sheet(shown))),
     }
     touched = (edited != unedited).any(axis=(0, 3))
+    row = int(touched.sum(axis=1).argmax())
+    found["slice"] = write_png(folder / "sequence" / f"slice_{name}.png", as_bytes(_slice(unedited, edited, row)))
     if touched.any():
         found["flicker_edited_where_touched"] = flicker(edited[:, touched])
         found["flicker_unedited_where_touched"] = flicker(unedited[:, touched])
@@ -81,6 +88,13 @@ def flicker(images: F32 | F64) -> float:
     light = np.asarray(images, np.float64).mean(axis=-1)
     logarithm = np.log(np.maximum(light, 0.01 * light.mean() + 1e-12))
     return float(np.sqrt((np.diff(logarithm, 2, axis=0) ** 2).mean()))
+
+
+def _slice(unedited: F32, edited: F32, row: int) -> F32:
+    """One row of pixels, frame below frame, without edits on the left and with them on the right; twice as wide."""
+    white = 1 / np.quantile(edited[:, row], 0.98)
+    sides = [np.repeat(np.repeat(images[:, row] * white, _SLICE, axis=0), 2, axis=1) for images in (unedited, edited)]
+    return np.asarray(np.concatenate(sides, axis=1), np.float32)
 
 
 def _video(images: list[F32], path: Path) -> str | None:
@@ -111,4 +125,17 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
             f" {found['seconds_a_frame']:.2f} s | {found['flicker_unedited']:.4f} | {found['flicker_edited']:.4f} |"
             f" {' | '.join(cells)} |"
         )
-    return lines
+    return [*lines, "", *_goals([one for one in results if "result" in one])]
+
+
+def _goals(done: list[dict[str, Any]]) -> list[str]:
+    """Flicker with edits over that without, of the same pixels."""
+    ratios = [
+        Goal(
+            one["case"]["seeds"], found["flicker_edited_where_touched"] / found["flicker_unedited_where_touched"], 1.05
+        )
+        for one in done
+        for found in [one["result"]]
+        if found.get("flicker_unedited_where_touched")
+    ]
+    return [at_most("flicker where edits act over that without edits,", ratios)] if ratios else []

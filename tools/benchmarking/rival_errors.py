@@ -8,15 +8,13 @@ import numpy as np
 
 from icheat_usd.scene import F64, Bool
 from tools.benchmarking.references import Reference
+from tools.benchmarking.statistics import smoothed
 
 #: Share of the pixels that a trimmed error leaves out.
 TRIMMED = 0.001
 
 #: Keeps dark pixels from deciding alone, as a share of the mean reference, squared.
 _EPSILON = 0.01
-
-#: Pixels to either side that the reference in the denominator is smoothed over.
-_SMOOTH = 2
 
 
 def squared_errors(image: F64, half_a: F64, half_b: F64) -> F64:
@@ -32,20 +30,9 @@ def squared_errors(image: F64, half_a: F64, half_b: F64) -> F64:
     mean of the product is that of ``(I - R)^2`` for R without noise, if the weight does not know the pixel's own
     noise: not smoothed, exact images had an error of 6 s^4, s^2 being the relative variance of (A + B) / 2.
     """
-    smooth = _smoothed((half_a + half_b) / 2)
+    smooth = smoothed((half_a + half_b) / 2)
     weight = 1 / (smooth**2 + _EPSILON * smooth.mean() ** 2)
     return np.asarray(((image - half_a) * (image - half_b) * weight).mean(axis=2))
-
-
-def _smoothed(image: F64) -> F64:
-    """Mean over squares of 5 x 5 pixels, at the border over what there is of them."""
-    for axis in (0, 1):
-        n = image.shape[axis]
-        total = np.concatenate([np.zeros_like(image.take([0], axis)), np.cumsum(image, axis)], axis)
-        low, high = np.maximum(np.arange(n) - _SMOOTH, 0), np.minimum(np.arange(n) + _SMOOTH + 1, n)
-        count = (high - low).reshape([-1 if k == axis else 1 for k in range(image.ndim)])
-        image = (total.take(high, axis) - total.take(low, axis)) / count
-    return image
 
 
 def rel_mse(squares: F64) -> float:

@@ -29,7 +29,7 @@ from tools.benchmarking.references import Reference, default_folder, reference
 from tools.benchmarking.render_efforts import RenderEffort, efforts
 from tools.benchmarking.render_frame import Frame, warm
 from tools.benchmarking.render_images import write_sheet
-from tools.benchmarking.rival_errors import errors
+from tools.benchmarking.rival_errors import TRIMMED, errors
 from tools.benchmarking.rival_scenes import RivalScene, rival_scene
 from tools.peers import luxcore_peer, oidn_peer
 
@@ -37,8 +37,14 @@ from tools.peers import luxcore_peer, oidn_peer
 N_BOUNCES = GatherSettings().n_bounces
 DEPTH = N_BOUNCES + 2
 
+REFERENCE = "reference"
+RENDERERS = ("ours", "llvm", "scalar", "luxcore")
+
 #: Sheets show each renderer after so many seconds.
 _SHOWN_AFTER = 4.0
+
+#: Camera samples a pixel that are in memory together.
+_AT_ONCE = 4
 
 _LUXCORE_SAMPLES, _QUICK_LUXCORE_SAMPLES = (4, 16, 64), (2,)
 _SCALAR_SECONDS = 30.0  # what it is for is seen by then
@@ -48,26 +54,27 @@ def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
     """The reference of every stage first, which the others read."""
     found = []
     for stage in stages:
-        found.append({"stage": stage, "renderer": "reference"})
-        found += [{"stage": stage, "renderer": "ours", "effort": name} for name in efforts(quick)]
-        found += [{"stage": stage, "renderer": name} for name in ("llvm", "scalar", "luxcore")]
+        found.append({"stage": stage, "renderer": REFERENCE})
+        found += [{"stage": stage, "renderer": name} for name in RENDERERS]
     return found
 
 
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
     """Curves by name, with what is to be known of them; `absent` says why there are none."""
     renderer = case["renderer"]
-    if case["renderers"] and renderer not in (*case["renderers"].split(","), "reference"):
+    if case["renderers"] and renderer not in (*case["renderers"].split(","), REFERENCE):
         return {"curves": {}, "absent": {renderer: "not asked for"}}
     scene = rival_scene(case["stage"], effort.width, effort.height)
     kept = Path(case["references"]) if case["references"] else default_folder()
-    minutes = case["reference_minutes"] if renderer == "reference" else 0.0
+    minutes = case["reference_minutes"] if renderer == REFERENCE else 0.0
     known = reference(scene.name, scene.snapshot, DEPTH, kept, minutes=minutes)
-    if renderer == "reference":
+    if renderer == REFERENCE:
         return _of_reference(known, scene)
     stand = _Stand(scene.snapshot, known, folder, scene.name, quick)
     if renderer == "ours":
-        return _ours(stand, case["effort"], efforts(quick)[case["effort"]])
+        chosen = efforts(quick)
+        names = case["efforts"].split(",") if case["efforts"] else list(chosen)
+        return _ours(stand, {name: chosen[name] for name in names})
     if renderer == "luxcore":
         return _luxcore(stand, _QUICK_LUXCORE_SAMPLES if quick else _LUXCORE_SAMPLES)
     seconds = min(case["seconds"], _SCALAR_SECONDS) if renderer == "scalar" else case["seconds"]
@@ -121,12 +128,16 @@ def _features(snapshot: SceneSnapshot, tracer: Tracer, samples: int) -> tuple[F3
     Those that show some of a source, whose cover is black, or of the void do not count: sources are seen in some
     renderers only.
     """
-    view = view_samples(snapshot, tracer, samples_per_pixel=samples, max_splits=0)
-    shape = (view.height, view.width, -1)
-    layers = [average(view, x).reshape(shape).astype(np.float32) for x in (view.points.albedo, view.points.normal)]
-    lit = view.points.albedo.any(axis=1)
-    seen = np.bincount(view.pixel[lit], minlength=view.width * view.height).reshape(shape[:2]) == samples
-    return layers[0], layers[1], seen
+    camera = snapshot.camera
+    shape = (camera.height, camera.width)
+    layers, n_lit = np.zeros((2, *shape, 3)), np.zeros(shape, np.int64)
+    for part in range(0, samples, _AT_ONCE):
+        view = view_samples(snapshot, tracer, samples_per_pixel=_AT_ONCE, centred=False, seed=part, max_splits=0)
+        layers += [average(view, x).reshape(*shape, 3) for x in (view.points.albedo, view.points.normal)]
+        lit = view.points.albedo.any(axis=1)
+        n_lit += np.bincount(view.pixel[lit], minlength=n_lit.size).reshape(shape)
+    albedo, normal = (layers * (_AT_ONCE / samples)).astype(np.float32)
+    return albedo, normal, n_lit == samples
 
 
 def _of_reference(known: Reference, scene: RivalScene) -> dict[str, Any]:
@@ -137,6 +148,7 @@ def _of_reference(known: Reference, scene: RivalScene) -> dict[str, Any]:
             "samples_per_half": known.samples,
             "seconds": known.seconds,
             "noise": known.noise(),
+            "noise_trimmed": known.noise(TRIMMED),
             "depth": DEPTH,
             "lights_left_out": scene.left_out,
             "lights_added": scene.added,
@@ -145,13 +157,18 @@ def _of_reference(known: Reference, scene: RivalScene) -> dict[str, Any]:
     }
 
 
-def _ours(stand: _Stand, name: str, effort: RenderEffort) -> dict[str, Any]:
-    effort = RenderEffort(replace(effort.settings, n_bounces=N_BOUNCES), replace(effort.quality, n_bounces=N_BOUNCES))
-    warm(stand.snapshot, effort)
-    frame = Frame(stand.snapshot, effort)
-    found, seconds = frame.render(frame.field())
-    render = _Render(name, seconds, found.indirect, found.direct + found.indirect)
-    return {"curves": {f"ours, {name}": stand.curve(f"ours {name}", iter([render]))}, "cells": frame.light_seconds}
+def _ours(stand: _Stand, chosen: dict[str, RenderEffort]) -> dict[str, Any]:
+    """Every effort from the snapshot on: none has anything of another."""
+    curves = {}
+    for name, effort in chosen.items():
+        settings, quality = (replace(part, n_bounces=N_BOUNCES) for part in effort)
+        effort = RenderEffort(settings, quality)
+        warm(stand.snapshot, effort)
+        frame = Frame(stand.snapshot, effort)
+        found, seconds = frame.render(frame.field())
+        render = _Render(name, seconds, found.indirect, found.direct + found.indirect)
+        curves[f"ours, {name}"] = stand.curve(f"ours {name}", iter([render]))
+    return {"curves": curves}
 
 
 def _mitsuba(stand: _Stand, variant: str, seconds: float) -> dict[str, Any]:
