@@ -16,7 +16,7 @@ from tools.benchmarking import rival_summary
 from tools.benchmarking.goals import Goal, at_least, at_most
 from tools.benchmarking.mitsuba_layers import MitsubaLayers
 from tools.benchmarking.references import Reference
-from tools.benchmarking.render_sequence import flicker
+from tools.benchmarking.render_sequence import flicker, flicker_of_median
 from tools.benchmarking.rival_errors import squared_errors, trimmed_rel_mse
 from tools.benchmarking.rival_scenes import rival_scene
 
@@ -146,6 +146,9 @@ def test_flicker_is_nothing_where_light_changes_evenly() -> None:
     frame = np.linspace(0, 1, 6)[:, None, None, None]
     even = np.exp(frame) * np.ones((6, 4, 4, 3))
     assert flicker(even) == pytest.approx(0, abs=1e-12)
+    moving = even.copy()
+    moving[::2, 0] *= 3
+    assert flicker(moving) > 0.1 and flicker_of_median(moving) == pytest.approx(0, abs=1e-12)
     jumping = even * np.where(np.arange(6) % 2, 1.1, 1.0)[:, None, None, None]
     assert flicker(jumping) == pytest.approx(2 * np.log(1.1), rel=1e-6)
 

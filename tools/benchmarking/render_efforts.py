@@ -52,7 +52,7 @@ EFFORTS: dict[str, RenderEffort] = {
     ),
 }
 
-#: What is measured where one effort must do, and the lesser one for the cost of edits, which takes many renders.
+#: What is measured where one effort must do, and the lesser one for costs of edits and sequences: many renders.
 USUAL, EDITED = "cached 3", "cached 2"
 
 _LEAST = replace(PREVIEW, n_gather=512, rays_per_bounce_row=16, light_samples=2)
@@ -75,5 +75,5 @@ def usual(quick: bool) -> RenderEffort:
 
 
 def edited(quick: bool) -> RenderEffort:
-    """The one that costs of edits are measured with."""
+    """The one that costs of edits and sequences are measured with."""
     return QUICK["cached"] if quick else EFFORTS[EDITED]
