@@ -38,6 +38,9 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"layer of .exr files, see above; may be given several times; default {', '.join(DEFAULT)}",
     )
+    parser.add_argument(
+        "--records", metavar="FILE", help=".png that maps the records of cached light: their reach, and their rounds"
+    )
     parser.add_argument("--single-part", action="store_true", help="all layers in one part of an .exr")
     parser.add_argument("--force", action="store_true", help="render frames again that are there already")
     parser.add_argument("--samples", type=positive, metavar="N", help="camera samples a pixel")

@@ -111,9 +111,10 @@ def _views(
         if options.aov and all(name.lower().endswith(".png") for name in options.out):
             raise ImageError("--aov is for .exr files; choose what a .png shows with --show")
         layers = _layers(options.aov or layer_names.DEFAULT, "--aov")
-        return (
-            _View(None, None, tuple(_output(options, pattern, layers, frame, n_frames) for pattern in options.out)),
-        )
+        files = tuple(_output(options, pattern, layers, frame, n_frames) for pattern in options.out)
+        return (_View(None, None, files + _map_of_records(options, frame, n_frames)),)
+    if options.records is not None:
+        raise ImageError("--records goes with -o FILE")
     if options.aov:
         raise ImageError("--aov goes with -o FILE; products name their layers in orderedVars")
     products, findings = read_render_products(stage, frame, options.product)
@@ -134,6 +135,16 @@ def _views(
     return tuple(
         _View(group[0][0].path, group[0][0].camera, tuple(output for _, output in group)) for group in grouped.values()
     )
+
+
+def _map_of_records(options: argparse.Namespace, frame: float | None, n_frames: int) -> tuple[Output, ...]:
+    if options.records is None:
+        return ()
+    path = output_path(options.records, frame, n_frames, "--records")
+    if path.suffix.lower() != ".png":
+        raise ImageError(f"--records {options.records}: the name must end in .png; --aov records is for .exr files")
+    shown = tuple(layer_names.Layer(name, name) for name in ("records", "indirect"))
+    return (Output(path, shown, is_map=True),)
 
 
 def _output(

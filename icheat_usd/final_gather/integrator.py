@@ -81,7 +81,16 @@ class FinalGather:
     #: light of groups of lights, by one of `light_parts.KINDS` and the group's name; if asked for
     coverage: Mapping[str, Coverage] = field(default_factory=lambda: MappingProxyType({}))
     #: which prims ("object") and edits ("edit") the pixels show; if asked for
+    records: CacheRecords | None = None  #: of the cached method
     replay: Replay | None = None  #: the same frame under other edits; if asked for, and only by the cached method
+
+
+class CacheRecords(NamedTuple):
+    """Where n records of cached light stand in the picture, as seen over mirrors and through glass too."""
+
+    pixel: I64  #: (n,) row-major
+    reach: F32  #: (n,) pixels
+    spacing: I64  #: (n,) pixels between the places of the overture's round that asked for it
 
 
 class _Band(NamedTuple):
@@ -161,9 +170,9 @@ def final_gather(
     find: FindLight = partial(_followed, gatherer)
     bands: list[_Band] = []
     kept: list[KeptBand] = []
-    replay = None
+    replay, records = None, None
     if is_cached and gather is not None and gather_radiance is not None:
-        cached = _cached(gatherer, gather, camera, settings, seed, is_kept, progress)
+        cached, records = _cached(gatherer, gather, camera, settings, seed, is_kept, progress)
         find = partial(_interpolated, gatherer, cached)
         replay = Replay(gatherer, cached, kept, gather_radiance) if is_kept else None
     for number, (pixels, view) in enumerate(camera.all()):
@@ -184,6 +193,7 @@ def final_gather(
         contributions=whole([part.contributions for part in bands]),
         light_groups=whole([part.light_groups for part in bands]),
         coverage={name: weighted_sum((1.0, part[name]) for part in mattes) for name in mattes[0]},
+        records=records,
         replay=replay,
     )
 
@@ -196,7 +206,7 @@ def _cached(
     seed: int,
     is_kept: bool,
     progress: Progress,
-) -> CachedGather:
+) -> tuple[CachedGather, CacheRecords]:
     """Place all records, by the camera samples that every pixel has."""
     assert gatherer.solution is not None
     snapshot = gatherer.snapshot
@@ -209,8 +219,9 @@ def _cached(
     for _, view in camera.first():
         found.append(places_of(snapshot, gatherer.tracer, view, seed))
         pixel.append(view.pixel)
-    overture(cache, join_places(found), np.concatenate(pixel), snapshot.camera.width, progress)
-    return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept)
+    placed = overture(cache, join_places(found), np.concatenate(pixel), snapshot.camera.width, progress)
+    records = CacheRecords(placed.pixel, cache.table.reach / placed.extent, placed.spacing)
+    return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept), records
 
 
 def _followed(gatherer: Gatherer, view: ViewSamples, stream: I64, seed: int) -> GatheredLight:

@@ -95,6 +95,14 @@ class Places(NamedTuple):
         return np.maximum(self.near, settings.least_reach * self.extent).astype(np.float32)
 
 
+class Placed(NamedTuple):
+    """Where n records were asked for, in the order of the cache."""
+
+    pixel: I64  #: (n,) row-major
+    extent: F32  #: (n,) metres that a pixel spans there
+    spacing: I64  #: (n,) pixels between the places of the round that asked
+
+
 def join_places(parts: list[Places]) -> Places:
     """All of them, one after another."""
     return Places(
@@ -331,7 +339,7 @@ class IrradianceCache:
         return self._index
 
 
-def overture(cache: IrradianceCache, places: Places, pixel: I32, width: int, progress: Progress = silent) -> None:
+def overture(cache: IrradianceCache, places: Places, pixel: I32, width: int, progress: Progress = silent) -> Placed:
     """Place records so that all places are covered: on a grid of pixels, then ever finer ones between.
 
     Parameters
@@ -340,6 +348,7 @@ def overture(cache: IrradianceCache, places: Places, pixel: I32, width: int, pro
     pixel : (m,)
         Their pixels, row-major in an image `width` wide.
     """
+    asked, spacing = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     x, y = pixel % width, pixel // width
     waiting = np.ones(len(pixel), bool)
     step = _COARSEST
@@ -351,15 +360,19 @@ def overture(cache: IrradianceCache, places: Places, pixel: I32, width: int, pro
         progress("place records", number / len(rounds))
         due = np.flatnonzero(waiting & (x % step == shift) & (y % step == shift))
         waiting[due] = False
-        fill(cache, places, due)
+        asked.append(fill(cache, places, due))
+        spacing.append(np.full(len(asked[-1]), step, np.int64))
     progress("place records", 1.0)
+    which = np.concatenate(asked)
+    return Placed(pixel[which].astype(np.int64), places.extent[which], np.concatenate(spacing))
 
 
-def fill(cache: IrradianceCache, places: Places, due: I64) -> None:
-    """Records for those of some places that are not covered."""
+def fill(cache: IrradianceCache, places: Places, due: I64) -> I64:
+    """Records for those of some places that are not covered, which are returned."""
     if len(due) == 0:
-        return
+        return due
     some = places.take(due)
     new = np.flatnonzero(cache.find(some).coverage < cache.settings.coverage)
     if len(new):
         cache.add(some.take(new))
+    return due[new]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from icheat_usd.final_gather.integrator import FinalGather
+from icheat_usd.final_gather.integrator import CacheRecords, FinalGather
 from icheat_usd.image.cryptomatte import Coverage, weighted_sum
 from icheat_usd.scene import F64
 
@@ -29,6 +29,7 @@ def weighted_gather(moments: Iterable[tuple[float, FinalGather]]) -> FinalGather
     surface: dict[str, F64] = {}
     groups: dict[str, dict[Any, F64]] = {"contributions": {}, "light_groups": {}}
     coverage: dict[str, list[tuple[float, Coverage]]] = {}
+    records: list[CacheRecords] = []
     seen: F64 | None = None
     first: FinalGather | None = None
     count = 0
@@ -41,6 +42,7 @@ def weighted_gather(moments: Iterable[tuple[float, FinalGather]]) -> FinalGather
         _add(surface, {name: getattr(image, name) for name in _SURFACE}, is_seen)
         for name, sums in groups.items():
             _add(sums, getattr(image, name), weight)
+        records += [] if image.records is None else [image.records]
         for name, found in image.coverage.items():
             coverage.setdefault(name, []).append((weight, found))
     if first is not None:
@@ -62,6 +64,7 @@ def weighted_gather(moments: Iterable[tuple[float, FinalGather]]) -> FinalGather
         contributions=groups["contributions"],
         light_groups=groups["light_groups"],
         coverage=mattes,
+        records=CacheRecords(*map(np.concatenate, zip(*records, strict=True))) if records else None,
     )
 
 

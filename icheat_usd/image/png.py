@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -53,10 +54,23 @@ def write_png(
     ImageError
         There is no such layer, display or view, or the file cannot be written.
     """
-    target = Path(path)
     pixels = to_display(film.layer(layer), display=display, view=view, exposure=exposure, dither=dither)
     srgb = (display or default_display()).startswith("sRGB")
-    encoded = encode_png(pixels, srgb=srgb, text={METADATA_PREFIX + key: text for key, text in film.metadata.items()})
+    return write_pixels(pixels, path, srgb=srgb, metadata=film.metadata)
+
+
+def write_pixels(
+    pixels: NDArray[np.uint8], path: str | os.PathLike[str], *, srgb: bool, metadata: Mapping[str, str]
+) -> Path:
+    """Write (height, width, 3) display-encoded bytes as an 8-bit RGB PNG, which says so if they are sRGB.
+
+    Raises
+    ------
+    ImageError
+        The file cannot be written.
+    """
+    target = Path(path)
+    encoded = encode_png(pixels, srgb=srgb, text={METADATA_PREFIX + key: text for key, text in metadata.items()})
     with replacing(target) as temporary:
         temporary.write_bytes(encoded)
     return target

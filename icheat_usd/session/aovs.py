@@ -154,6 +154,8 @@ def _values(result: FinalGather, source: str, scene: Scene) -> F64:
         return result.indirect_edited - result.indirect
     if source == "edit_ratio":
         return edit_ratio(direct + result.indirect_edited, direct + result.indirect)
+    if source == "records":
+        return _records(result)
     if source == "alpha":
         covered = result.coverage["object"]
         height, width, _ = direct.shape
@@ -168,6 +170,18 @@ def _values(result: FinalGather, source: str, scene: Scene) -> F64:
         return result.contributions.get(scene.edits[name], np.zeros_like(result.indirect))
     values: F64 = getattr(result, source)
     return values
+
+
+def _records(result: FinalGather) -> F64:
+    """Number of records in each pixel, widest reach and coarsest spacing."""
+    height, width, _ = result.indirect.shape
+    found = np.zeros((height * width, 3))
+    if result.records is not None:
+        pixel, reach, spacing = result.records
+        found[:, 0] = np.bincount(pixel, minlength=height * width)
+        np.maximum.at(found[:, 1], pixel, reach)
+        np.maximum.at(found[:, 2], pixel, spacing)
+    return found
 
 
 def edit_ratio(edited: F64, unedited: F64) -> F64:

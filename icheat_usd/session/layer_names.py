@@ -29,6 +29,8 @@ LAYERS: Mapping[str, str] = MappingProxyType(
         "albedo": "diffuse reflectance",
         "normal": "world space",
         "depth": "length of the path from the eye, metres",
+        "records": "cached light: how many records stand in the pixel, how far they reach and from which round of the "
+        "overture they are, both in pixels (the cached method only)",
         "crypto_object": "Cryptomatte of prims",
         "crypto_edit": "Cryptomatte of the edits that pixels receive",
     }

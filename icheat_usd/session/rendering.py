@@ -23,7 +23,8 @@ from icheat_usd.image.colour import configuration_id
 from icheat_usd.image.denoise import denoiser
 from icheat_usd.image.exr import write_exr
 from icheat_usd.image.film import Film
-from icheat_usd.image.png import write_png
+from icheat_usd.image.png import write_pixels, write_png
+from icheat_usd.image.record_map import record_map
 from icheat_usd.image.replacing import remove_abandoned
 from icheat_usd.image.whole import whole_metadata
 from icheat_usd.session import aovs, layer_names
@@ -48,6 +49,7 @@ class Output:
     view: str | None = None  #: OCIO view of a .png; None is the display's own
     exposure: float = 0.0  #: of a .png, stops
     product: str = ""  #: prim that asks for it
+    is_map: bool = False  #: a .png that shows the first layer, records of cached light, over the second one
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,8 @@ def render_film(session: Session, settings: GatherSettings, layers: Sequence[lay
     """
     if settings.denoise:
         denoiser()  # before hours of work
+    if settings.method != "cached" and any(layer.source == "records" for layer in layers):
+        raise ImageError(f"the {settings.method} method places no records; leave them out, or choose the cached method")
     stack = session.stack
     scene = aovs.layer_scene(session.snapshot, stack)
     members = aovs.expanded(layers, scene)
@@ -170,6 +174,8 @@ def _content(output: Output) -> tuple[object, ...]:
     """What of an output decides its bytes."""
     layers = [(layer.source, layer.name) for layer in output.layers]
     form = output.path.suffix.lower()
+    if output.is_map:
+        return form, layers, "map of records"
     if form == ".png":
         return form, layers[:1], output.view, output.exposure, configuration_id()
     return form, layers, sorted(output.half), output.multipart, output.product
@@ -199,7 +205,10 @@ def _write(film: Film, output: Output, members: Sequence[layer_names.Layer], key
     if output.product:
         described["product"] = output.product
     part = Film(film.width, film.height, layers, described, tuple(mattes), film.pixel_aspect)
-    if output.path.suffix.lower() == ".exr":
+    if output.is_map:
+        records, light = (part.layer(layer.name) for layer in members)
+        write_pixels(record_map(records, light), output.path, srgb=True, metadata=described)
+    elif output.path.suffix.lower() == ".exr":
         write_exr(part, output.path, half=output.half, multipart=output.multipart)
     else:
         write_png(part, output.path, layer=members[0].name, view=output.view, exposure=output.exposure)

@@ -124,6 +124,27 @@ def test_no_frame_keeps_another_one_in_memory(shot: Path, monkeypatch: pytest.Mo
     assert alive == [0, 0, 0]
 
 
+def test_records_are_pictured_frame_by_frame(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["render", str(shot), "--frames", "1:2", "-o", str(shot.parent / "f.####.exr"), *QUICK]
+    maps = ["--records", str(shot.parent / "map.####.png")]
+    assert main([*words, *maps]) == 2
+    assert "the brute method places no records" in capsys.readouterr().err
+    cached = ["--method", "cached"]
+    assert main([*words, *maps, *cached]) == 0
+    first = [(shot.parent / f"map.000{frame}.png").read_bytes() for frame in (1, 2)]
+    assert first[0] != first[1] and (shot.parent / "f.0001.exr").is_file()
+    (shot.parent / "map.0002.png").unlink()
+    capsys.readouterr()
+    assert main([*words, *maps, *cached]) == 0
+    assert capsys.readouterr().err.count("kept") == 3
+    assert (shot.parent / "map.0002.png").read_bytes() == first[1]
+    for wrong, message in (("map.####.exr", "must end in .png"), ("map.png", "2 frames would share one file")):
+        assert main([*words, "--records", str(shot.parent / wrong), *cached]) == 2
+        assert message in capsys.readouterr().err
+    assert main(["render", str(shot), "--records", str(shot.parent / "m.png")]) == 2
+    assert "--records goes with -o FILE" in capsys.readouterr().err
+
+
 def test_layers_are_not_asked_of_a_png(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", str(shot), "-o", str(shot.parent / "f.png"), "--aov", "depth", *QUICK]) == 2
     assert "--aov is for .exr files" in capsys.readouterr().err
