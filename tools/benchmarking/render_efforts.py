@@ -52,8 +52,8 @@ EFFORTS: dict[str, RenderEffort] = {
     ),
 }
 
-#: What is measured where one effort must do, and the lesser one for costs of edits and sequences: many renders.
-USUAL, EDITED = "cached 3", "cached 2"
+#: What is measured where one effort must do, and where that takes many renders: cost of edits, growth, sequences.
+USUAL, LESSER = "cached 3", "cached 2"
 
 _LEAST = replace(PREVIEW, n_gather=512, rays_per_bounce_row=16, light_samples=2)
 
@@ -74,6 +74,15 @@ def usual(quick: bool) -> RenderEffort:
     return QUICK["cached"] if quick else EFFORTS[USUAL]
 
 
-def edited(quick: bool) -> RenderEffort:
-    """The one that costs of edits and sequences are measured with."""
-    return QUICK["cached"] if quick else EFFORTS[EDITED]
+def lesser(quick: bool) -> RenderEffort:
+    """The one for many renders."""
+    return QUICK["cached"] if quick else EFFORTS[LESSER]
+
+
+def said_of_lesser(width: int, height: int) -> str:
+    """What tables of figures that were measured with it begin with."""
+    settings, quality = EFFORTS[LESSER]
+    return (
+        f"Effort '{LESSER}' of suite rivals ({quality.n_gather:,} gather samples, records of {settings.cache.noise:.0%}"
+        f" noise), {width}x{height} unless said otherwise."
+    )

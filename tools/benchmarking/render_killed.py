@@ -28,9 +28,8 @@ _KILLS, _QUICK_KILLS = 10, 1
 _WHILE_WRITING = 3
 _SIZE, _QUICK_SIZE = (160, 120), (12, 9)
 
-#: When a process is killed at random, as shares of what the whole sequence takes: much later, and nothing would be
-#: left to kill at the end.
-_EARLIEST, _LATEST = 0.02, 0.18
+#: Random kills come at most so many frames after the first one is begun: later, and none would be left for the last.
+_FRAMES_A_KILL = 2.0
 
 
 def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
@@ -44,11 +43,11 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         alone, killed = Path(scratch) / "alone", Path(scratch) / "killed"
         alone.mkdir()
         killed.mkdir()
-        start = time.perf_counter()
-        _run(case["stage"], alone, quick).wait()
-        whole = time.perf_counter() - start
-        rng = np.random.default_rng(0x51)
-        delays = rng.uniform(_EARLIEST, _LATEST, _QUICK_KILLS if quick else _KILLS) * whole
+        # Twice, as the first one may compile.
+        one = [_seconds(case["stage"], alone, quick, 1) for _ in range(2)][-1]
+        whole = _seconds(case["stage"], alone, quick, len(_names(quick)))
+        latest = one + (_FRAMES_A_KILL - 1) * (whole - one) / (len(_names(quick)) - 1)
+        delays = np.random.default_rng(0x51).uniform(0, latest, _QUICK_KILLS if quick else _KILLS)
         kills = [_kill_one(case["stage"], killed, quick, float(delay)) for delay in delays]
         kills += [_kill_one(case["stage"], killed, quick, None) for _ in range(1 if quick else _WHILE_WRITING)]
         start = time.perf_counter()
@@ -73,10 +72,18 @@ def _names(quick: bool) -> list[str]:
     return [f"frame.{i:04d}.exr" for i in range(1, 1 + (_QUICK_FRAMES if quick else _FRAMES))]
 
 
-def _run(stage: str, folder: Path, quick: bool) -> subprocess.Popen[bytes]:
+def _seconds(stage: str, folder: Path, quick: bool, frames: int) -> float:
+    """Of the first frames, whether they are there or not."""
+    start = time.perf_counter()
+    _run(stage, folder, quick, frames, "--force").wait()
+    return time.perf_counter() - start
+
+
+def _run(stage: str, folder: Path, quick: bool, frames: int = 0, *more: str) -> subprocess.Popen[bytes]:
     """As a user starts it, at full effort; a quick one by brute force, which has less to load."""
     width, height = _QUICK_SIZE if quick else _SIZE
-    command = [sys.executable, "-m", "icheat_usd", "render", stage, "--frames", f"1:{len(_names(quick))}"]
+    shown = f"1:{frames or len(_names(quick))}"
+    command = [sys.executable, "-m", "icheat_usd", "render", stage, "--frames", shown, *more]
     command += ["--width", str(width), "--height", str(height), "-o", str(folder / "frame.####.exr")]
     command += ["--method", "brute", "--samples", "1", "--rays", "16"] if quick else ["--method", "cached"]
     output = subprocess.DEVNULL
@@ -94,8 +101,8 @@ def _kill_one(stage: str, folder: Path, quick: bool, delay: float | None) -> dic
         if is_writing if delay is None else time.perf_counter() - start >= delay:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-        elif delay is not None:
-            time.sleep(0.002)
+        else:
+            time.sleep(0.001)
     there = sorted(folder.glob("frame.*.exr"))
     return {
         "after_seconds": time.perf_counter() - start,

@@ -19,7 +19,7 @@ from tools.benchmarking.generated import write_room
 from tools.benchmarking.goals import Goal, at_most
 from tools.benchmarking.meter import PeakMemory
 from tools.benchmarking.parts import Effort
-from tools.benchmarking.render_efforts import usual
+from tools.benchmarking.render_efforts import lesser, said_of_lesser
 from tools.benchmarking.render_frame import Frame, warm
 from tools.benchmarking.test_lights import TestLight, add_lights, with_lights
 
@@ -54,14 +54,16 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         n_triangles = size if what == "triangles" else (400 if quick else _USUAL_TRIANGLES)
         small = write_room(Path(scratch) / "small.usda", 200)
         stage = Path(case["stage"]) if what == "stage" else write_room(Path(scratch) / "room.usda", n_triangles)
-        warm(_snapshot(stage if what == "stage" else small, 32, 24, case), usual(quick))
+        warm(_snapshot(stage if what == "stage" else small, 32, 24, case), lesser(quick))
         peak, start = PeakMemory(), time.perf_counter()
         snapshot = _snapshot(stage, width, height, case)
-    frame = Frame(snapshot, usual(quick))
+    frame = Frame(snapshot, lesser(quick))
     _ = frame.tracer
     load_seconds = time.perf_counter() - start
     _, seconds = frame.render(frame.field())
     found = {
+        "width": effort.width,
+        "height": effort.height,
         "what": what,
         "size": width * height if what == "pixels" else size,
         "named": {"pixels": f"{width}x{height} pixels", "stage": case["name"]}.get(what, f"{size:,} {what}"),
@@ -112,14 +114,16 @@ def _lit(snapshot: SceneSnapshot, n: int) -> SceneSnapshot:
 
 def markdown(results: list[dict[str, Any]]) -> list[str]:
     """Table for README."""
-    lines = ["| size | load | render | of it light of the gather samples | peak memory |"]
+    done = [one["result"] for one in results if "result" in one]
+    if not done:
+        return []
+    lines = [said_of_lesser(done[0]["width"], done[0]["height"]), ""]
+    lines += ["| size | load | render | of it light of the gather samples | peak memory |"]
     lines.append("| --- | ---: | ---: | ---: | ---: |")
-    for point in (one["result"] for one in results if "result" in one):
+    for point in done:
         lines.append(
             f"| {point['named']} | {point['load_seconds']:.2f} s | {point['render_seconds']:.2f} s |"
             f" {point['cell_seconds']:.2f} s | {point['peak_mib'] / 1024:.2f} GiB |"
         )
-    peaks = [
-        Goal(f"{one['named']}", one["peak_mib"] / 1024, 8) for one in (o["result"] for o in results if "result" in o)
-    ]
+    peaks = [Goal(f"{one['named']}", one["peak_mib"] / 1024, 8) for one in done]
     return [*lines, "", at_most("peak memory in GiB", peaks)]
