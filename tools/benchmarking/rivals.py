@@ -43,6 +43,9 @@ RENDERERS = ("ours", "llvm", "scalar", "luxcore")
 #: Sheets show each renderer after so many seconds.
 _SHOWN_AFTER = 4.0
 
+#: Samples a pixel after which a path tracer is looked at: denoising and FLIP take seconds.
+_SHOWN_SAMPLES = tuple(4**i for i in range(12))
+
 #: Camera samples a pixel that are in memory together.
 _AT_ONCE = 4
 
@@ -191,7 +194,7 @@ def _mitsuba(stand: _Stand, variant: str, seconds: float) -> dict[str, Any]:
             found = tracer.layers(samples, seed)
             total += samples * np.stack([found.indirect, found.whole])
             n, spent, seed = n + samples, spent + found.seconds, seed + 1
-            if n & (n - 1) == 0 or spent >= seconds:
+            if n in _SHOWN_SAMPLES or spent >= seconds:
                 indirect, whole = total / n
                 if denoise is not None:
                     denoised.append(_denoised(denoise, f"{n} spp", spent, indirect, whole))
