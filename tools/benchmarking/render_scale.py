@@ -24,7 +24,7 @@ from tools.benchmarking.render_frame import Frame, warm
 from tools.benchmarking.test_lights import TestLight, add_lights, with_lights
 
 _TRIANGLES, _QUICK_TRIANGLES = (10_000, 100_000, 1_000_000), (100, 400)
-_LIGHTS, _QUICK_LIGHTS = (1, 4, 16, 64), (1, 3)
+_LIGHTS, _QUICK_LIGHTS = (1, 8, 64), (1, 3)
 _WIDTHS, _QUICK_WIDTHS = (320, 640, 1280, 1920), (16, 32)
 
 #: Where it is not what grows.

@@ -117,6 +117,8 @@ def work(benchmark: Benchmark, task: dict[str, Any]) -> int:
 def markdown(benchmark: Benchmark, report: dict[str, Any]) -> str:
     """Tables for README of every suite that was run."""
     lines = [f"`{report['command']}` on {report['machine']['cpu']}, {report['machine']['cores']} cores.", ""]
+    if report["quick"]:
+        lines += ["Of tiny images at the least effort, whatever tables say: to see that everything runs.", ""]
     for name, results in report["suites"].items():
         lines += [f"### {name}", "", *_module(benchmark, name).markdown(results), ""]
         lines += [
