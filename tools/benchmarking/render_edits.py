@@ -72,7 +72,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         stacks[f"{most} apart"] = stack_of(frame, shares, case["encoding"], most, apart=True)
     for stack in stacks.values():
         warm(snapshot, lesser(quick), stack)
-    _ = frame.cell_radiance
+    frame.render(frame.field())  # which takes longer, as memory is new
     times = interleaved(frame, stacks, _QUICK_ROUNDS if quick else _ROUNDS)
     none = statistics.median(times["none"])
     found = {
