@@ -107,7 +107,7 @@ def _second_differences(images: F32 | F64) -> F64:
 
 def _slice(unedited: F32, edited: F32, row: int) -> F32:
     """One row of pixels, frame below frame, without edits on the left and with them on the right; twice as wide."""
-    white = 1 / np.quantile(edited[:, row], 0.98)
+    white = 1 / max(float(np.quantile(edited[:, row], 0.98)), 1e-12)
     sides = [np.repeat(np.repeat(images[:, row] * white, _SLICE, axis=0), 2, axis=1) for images in (unedited, edited)]
     return np.asarray(np.concatenate(sides, axis=1), np.float32)
 
