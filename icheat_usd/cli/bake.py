@@ -23,6 +23,7 @@ from icheat_usd.cli.options import (
     finding_as_text,
     positive,
     print_json,
+    seed,
 )
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=positive, metavar="PIXELS", help="else the render settings' resolution")
     parser.add_argument("--height", type=positive, metavar="PIXELS")
     parser.add_argument("--gather", type=positive, metavar="N", help="gather samples; default 65536")
-    parser.add_argument("--seed", type=int, default=0, help="of all random numbers; default 0")
+    parser.add_argument("--seed", type=seed, default=0, help="of all random numbers; default 0")
     parser.add_argument(
         "--sidecar", metavar="FILE", help="folder or .icheat.h5 file for the rows; default by the layer"
     )

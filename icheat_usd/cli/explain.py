@@ -17,7 +17,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from icheat_usd.cli.options import add_frame, add_json, add_stack, add_stage, positive, print_json
+from icheat_usd.cli.options import add_frame, add_json, add_stack, add_stage, positive, print_json, seed
 from icheat_usd.errors import EditError, ImageError
 
 
@@ -33,7 +33,7 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--casters", type=positive, default=5, metavar="N", help="most casters to name; default 5")
     parser.add_argument("--gather", type=positive, metavar="N", help="gather samples; default 8192")
     parser.add_argument("--rays", type=positive, metavar="N", help="gather rays a row; images 128, pixels 1024")
-    parser.add_argument("--seed", type=int, default=0, help="of all random numbers; default 0")
+    parser.add_argument("--seed", type=seed, default=0, help="of all random numbers; default 0")
     add_json(parser)
 
 

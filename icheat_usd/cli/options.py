@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -75,6 +76,24 @@ def time_code(text: str) -> float:
     return time
 
 
+def number(text: str) -> float:
+    """A number that is one: no "nan", and none without end."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"'{text}' is no number, such as 1 or -0.5")
+    return value
+
+
+def seed(text: str) -> int:
+    """A seed that random numbers are made of."""
+    if not re.fullmatch(r"\d{1,9}", text.strip()):
+        raise argparse.ArgumentTypeError(f"'{text}' is no seed: a whole number from 0 to 999999999")
+    return int(text)
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object for programs")
 
@@ -101,9 +120,9 @@ def add_image(parser: argparse.ArgumentParser, without_out: str = "") -> None:
     parser.add_argument("--width", type=positive, metavar="PIXELS", help="else the render settings' resolution")
     parser.add_argument("--height", type=positive, metavar="PIXELS")
     parser.add_argument("--view", metavar="NAME", help="OCIO view of .png files; default the display's own")
-    parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="for .png files; default 0")
+    parser.add_argument("--exposure", type=number, default=0.0, metavar="STOPS", help="for .png files; default 0")
     parser.add_argument("--show", default="beauty", metavar="LAYER", help="film layer in .png files; default beauty")
-    parser.add_argument("--seed", type=int, default=0, help="of all random numbers; default 0")
+    parser.add_argument("--seed", type=seed, default=0, help="of all random numbers; default 0")
     parser.add_argument("--strict", action="store_true", help="exit with 1 if the stage has findings")
     add_json(parser)
 

@@ -82,6 +82,6 @@ def mask_image(result: FinalGather, edit: str) -> F32:
     shown, covered = result.coverage["object"], result.coverage["edit"]
     surfaces = np.bincount(shown.pixel, shown.share, height * width)
     mine = covered.id == name_id(edit)
-    mask = np.bincount(covered.pixel[mine], covered.share[mine], height * width)
+    mask = np.bincount(covered.pixel[mine], covered.share[mine], height * width).astype(np.float64)
     mask = np.divide(mask, surfaces, out=np.zeros_like(mask), where=surfaces > 0)
     return np.minimum(mask, 1.0).reshape(height, width).astype(np.float32)

@@ -97,7 +97,8 @@ def _shares(view: ViewSamples, pixels: tuple[int, int]) -> F64:
     """Share of its pixel that each sample is; what leaves the scene has the rest."""
     first, end = pixels
     weight = view.throughput.astype(np.float64).mean(axis=1)
-    total = np.bincount(view.pixel - first, weight, end - first)
+    total: F64 = np.zeros(end - first)
+    total += np.bincount(view.pixel - first, weight, end - first)
     escaped = view.sky.throughput.astype(np.float64).mean(axis=1)
     total += np.bincount(view.sky.pixel - first, escaped, end - first)
     place: I64 = view.pixel.astype(np.int64) - first

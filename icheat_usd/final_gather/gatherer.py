@@ -81,7 +81,7 @@ class Lobe(NamedTuple):
 
     def mean(self) -> F32:
         """Radiance that the points reflect by this lobe, (m, 3)."""
-        total = self.light.total.reshape(-1, self.n_rays, 3).sum(axis=1, dtype=np.float64)
+        total = self.light.total.reshape(len(self.where), self.n_rays, 3).sum(axis=1, dtype=np.float64)
         return self.tint * (total.astype(np.float32) / np.float32(self.n_rays))
 
 

@@ -27,19 +27,7 @@ def replacing(target: Path) -> Iterator[Path]:
     ImageError
         The folder is missing or cannot be written.
     """
-    if not target.parent.is_dir():
-        raise ImageError(f"{target}: there is no folder '{target.parent}'; make it first or choose another path")
-    if target.is_dir():
-        raise ImageError(f"{target}: is a folder; name a file in it")
-    remove_abandoned(target)
-    try:
-        # Opened by name with the usual mode, not by mkstemp, so that the umask decides who may read the image.
-        temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.tmp"
-        held = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-    except OSError as problem:
-        raise ImageError(
-            f"{target}: cannot write in this folder ({problem.strerror}); choose another path"
-        ) from problem
+    temporary, held = _temporary(target)
     try:
         # The lock goes with the process, however it ends: it tells others that this file is being written.
         with suppress(OSError):
@@ -53,6 +41,36 @@ def replacing(target: Path) -> Iterator[Path]:
     finally:
         os.close(held)
         temporary.unlink(missing_ok=True)
+
+
+def check_writable(target: Path) -> None:
+    """Find out whether a file can be made, which is better known before hours of work.
+
+    Raises
+    ------
+    ImageError
+        The folder is missing or cannot be written.
+    """
+    temporary, held = _temporary(target)
+    os.close(held)
+    temporary.unlink(missing_ok=True)
+
+
+def _temporary(target: Path) -> tuple[Path, int]:
+    """A new file beside `target`, open."""
+    if not target.parent.is_dir():
+        raise ImageError(f"{target}: there is no folder '{target.parent}'; make it first or choose another path")
+    if target.is_dir():
+        raise ImageError(f"{target}: is a folder; name a file in it")
+    remove_abandoned(target)
+    try:
+        # Opened by name with the usual mode, not by mkstemp, so that the umask decides who may read the image.
+        temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.tmp"
+        return temporary, os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+    except OSError as problem:
+        raise ImageError(
+            f"{target}: cannot write in this folder ({problem.strerror}); choose another path"
+        ) from problem
 
 
 def remove_abandoned(target: Path) -> None:

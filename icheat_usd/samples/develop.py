@@ -39,4 +39,5 @@ def _sums(view: ViewSamples, values: F32, pixels: tuple[int, int] | I64 | None) 
     else:
         first, end = pixels or (0, view.width * view.height)
         place, n = view.pixel - first, end - first
-    return np.stack([np.bincount(place, column, n) for column in values.T], axis=1)
+    # Of no samples at all, NumPy counts in whole numbers.
+    return np.stack([np.bincount(place, column, n) for column in values.T], axis=1).astype(np.float64, copy=False)

@@ -25,7 +25,7 @@ from icheat_usd.image.exr import write_exr
 from icheat_usd.image.film import Film
 from icheat_usd.image.png import write_pixels, write_png
 from icheat_usd.image.record_map import record_map
-from icheat_usd.image.replacing import remove_abandoned
+from icheat_usd.image.replacing import check_writable, remove_abandoned
 from icheat_usd.image.whole import whole_metadata
 from icheat_usd.session import aovs, layer_names
 from icheat_usd.session.content_keys import digest, library_version, snapshot_key
@@ -109,6 +109,8 @@ def write_outputs(
     kept = tuple(path for path, key in keys.items() if not force and _was_made_of(path, key))
     wanted = [output for output in outputs if output.path not in kept]
     if wanted:
+        for output in wanted:
+            check_writable(output.path)
         sources = dict.fromkeys(layer.source for output in wanted for layer in output.layers)
         scene = aovs.layer_scene(session.snapshot, stack)
         # Before hours of work: names that collide, or that this frame does not have.

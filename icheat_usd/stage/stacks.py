@@ -70,6 +70,8 @@ def find_stack(stage: Usd.Stage, stack: str | None = None, camera: str | None = 
     candidates = candidates or [path for path, cameras in cameras_of.items() if camera is None or not cameras]
     if len(candidates) == 1:
         return candidates[0]
+    if camera is not None and not stage.GetPrimAtPath(camera):
+        raise EditError(f"{camera} is named as camera but does not exist in {stage.GetRootLayer().identifier}")
     whose = f" for camera {camera}" if camera is not None else ""
     raise EditError(
         f"{stage.GetRootLayer().identifier}: {len(candidates) or 'none'} of the stacks {', '.join(cameras_of)} can be "

@@ -159,6 +159,10 @@ def test_layers_are_not_asked_of_a_png(shot: Path, capsys: pytest.CaptureFixture
         ("--aov lpe:C<RD>L", "no layer holds exactly the light of 'lpe:C<RD>L'; there are C.* (beauty)"),
         ("--aov light.Sun", "frame 1: there is no layer 'light.Sun' at this frame; there are light.Lamp"),
         ("--aov edit.warm", "there is no layer 'edit.warm' at this frame; there are edit.bleed"),
+        ("--seed -1", "'-1' is no seed: a whole number from 0 to 999999999"),
+        ("--seed 99999999999999999999", "'99999999999999999999' is no seed"),
+        ("--exposure nan", "'nan' is no number, such as 1 or -0.5"),
+        ("--camera /World/No", "/World/No is named as camera but does not exist in"),
         ("--product /Render/No", "no RenderProduct /Render/No; the stage has none"),
     ],
 )
@@ -169,6 +173,16 @@ def test_what_cannot_be_rendered_is_one_line(
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not content(shot)
+
+
+def test_a_folder_that_cannot_be_written_is_known_before_the_work(
+    shot: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("icheat_usd.session.rendering.render_film", lambda *_: pytest.fail("it was rendered"))
+    (shot.parent / "taken.exr").mkdir()
+    for out, message in (("/proc/f.exr", "cannot write in this folder"), ("taken.exr", "is a folder; name a file")):
+        assert main(["render", str(shot), "-o", str(shot.parent / out), *QUICK]) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_the_help_lists_every_layer(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icheat_usd.session import Quality
+from icheat_usd.session import DRAFT, GatherSettings, Quality, Session
+from icheat_usd.session.layer_names import FAMILIES, LAYERS
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.quality import LIVE
 from tests.session.test_session import ROOM
@@ -50,3 +51,20 @@ def test_a_surface_that_sees_no_other_has_packed_rows_without_light(tmp_path: Pa
     found = image(alone, PACKED, tmp_path)
     np.testing.assert_allclose(found[0, 0], [0.4, 0.8, 1.6], rtol=1e-6)
     np.testing.assert_allclose(found[-1, 6], 0.18 * np.float32([0.4, 0.8, 1.6]), rtol=0.02)
+
+
+@pytest.mark.parametrize("method", ["cached", "brute"])
+def test_every_layer_of_a_camera_that_sees_no_surface(method: str, tmp_path: Path) -> None:
+    stage = tmp_path / "stage.usda"
+    stage.write_text(ROOM.replace("(0, 0, 1.9)", "(0, 0, -9)").replace("    def Camera", SKY))
+    session = Session.open(stage, width=6, height=4, quality=DRAFT)
+    names = [name for name in (*LAYERS, *FAMILIES) if method == "cached" or name != "records"]
+    film = session.render(GatherSettings(samples_per_pixel=2, gather_rays=4, method=method), names)
+    sky = np.broadcast_to(np.float32([0.2, 0.4, 0.8]), (4, 6, 3))
+    shown = {"beauty", "direct", "background", "light.Sky", "light_direct.Sky"}
+    for name, layer in film.layers.items():
+        if name == "edit_ratio":
+            assert (layer == 1).all()
+        else:
+            np.testing.assert_allclose(layer, sky if name in shown else 0, rtol=1e-6, err_msg=name)
+    assert shown < film.layers.keys() and not film.mattes[0].ranks.any()
