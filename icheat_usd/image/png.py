@@ -120,19 +120,52 @@ def encode_png(pixels: NDArray[np.uint8], *, srgb: bool, text: dict[str, str]) -
     """
     # Written here because image libraries differ in which of these chunks they write, and from release to release.
     height, width, _ = pixels.shape
-    rows = pixels.reshape(height, width * 3)
-    filtered = np.full((height, 1 + width * 3), 2, dtype=np.uint8)  # column 0: the filter type of the row, "Up"
-    filtered[0, 1:] = rows[0]
-    filtered[1:, 1:] = rows[1:] - rows[:-1]
     chunks = [_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))]
     if srgb:
         chunks.append(_chunk(b"sRGB", b"\0"))  # rendering intent: perceptual
     for key, value in sorted(text.items()):
         keyword = key.encode("latin-1", "replace")[:79]
         chunks.append(_chunk(b"iTXt", keyword + b"\0\0\0\0\0" + value.encode("utf-8", "replace")))
-    chunks.append(_chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)))
+    chunks.append(_chunk(b"IDAT", _packed(pixels)))
     chunks.append(_chunk(b"IEND", b""))
     return _SIGNATURE + b"".join(chunks)
+
+
+def encode_animation(frames: NDArray[np.uint8], *, per_second: int = 24) -> bytes:
+    """Frames as the bytes of an animated PNG file [1]_, which repeats; it says that the values are sRGB.
+
+    Parameters
+    ----------
+    frames : (n, height, width, 3) uint8, display-encoded
+
+    References
+    ----------
+    .. [1] Portable Network Graphics (PNG) Specification, third edition, W3C 2025: chunks 11.3.6.
+    """
+    n, height, width, _ = frames.shape
+    chunks = [
+        _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
+        _chunk(b"acTL", struct.pack(">II", n, 0)),
+        _chunk(b"sRGB", b"\0"),
+    ]
+    for number, frame in enumerate(frames):
+        # Control and data chunks are counted together; the data of the first frame is the still image.
+        place = struct.pack(">IIIIIHHBB", max(2 * number - 1, 0), width, height, 0, 0, 1, per_second, 0, 0)
+        chunks.append(_chunk(b"fcTL", place))
+        data = _packed(frame)
+        chunks.append(_chunk(b"fdAT", struct.pack(">I", 2 * number) + data) if number else _chunk(b"IDAT", data))
+    chunks.append(_chunk(b"IEND", b""))
+    return _SIGNATURE + b"".join(chunks)
+
+
+def _packed(pixels: NDArray[np.uint8]) -> bytes:
+    """Rows of (height, width, 3) pixels, filtered and compressed."""
+    height, width, _ = pixels.shape
+    rows = pixels.reshape(height, width * 3)
+    filtered = np.full((height, 1 + width * 3), 2, dtype=np.uint8)  # column 0: the filter type of the row, "Up"
+    filtered[0, 1:] = rows[0]
+    filtered[1:, 1:] = rows[1:] - rows[:-1]
+    return zlib.compress(filtered.tobytes(), 6)
 
 
 def _chunk(kind: bytes, body: bytes) -> bytes:

@@ -7,8 +7,6 @@ at there are a sheet of the frames, and a slice: one row of pixels of every fram
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from icheat_usd.image.contact import contact_sheet
+from icheat_usd.image.png import encode_animation
 from icheat_usd.scene import F32, F64
 from icheat_usd.session import Session
 from icheat_usd.stage import open_stage
@@ -79,7 +78,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     if touched.any():
         found["flicker_edited_where_touched"] = flicker(edited[:, touched])
         found["flicker_unedited_where_touched"] = flicker(unedited[:, touched])
-    found["video"] = _video(shown, folder / "sequence" / f"{name}.mp4")
+    found["video"] = _video(shown, folder / "sequence" / f"{name}_moving.png")
     return found
 
 
@@ -112,17 +111,11 @@ def _slice(unedited: F32, edited: F32, row: int) -> F32:
     return np.asarray(np.concatenate(sides, axis=1), np.float32)
 
 
-def _video(images: list[F32], path: Path) -> str | None:
-    """The frames as a video, where ffmpeg is installed."""
-    if shutil.which("ffmpeg") is None:
-        return None
-    pixels = np.stack([as_bytes(image) for image in images])
-    height, width = pixels.shape[1:3]
+def _video(images: list[F32], path: Path) -> str:
+    """The frames as an animated PNG, which browsers play."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    command += ["-r", "24", "-i", "-", "-pix_fmt", "yuv420p", str(path)]
-    done = subprocess.run(command, input=pixels.tobytes(), check=False)
-    return path.name if done.returncode == 0 else None
+    path.write_bytes(encode_animation(np.stack([as_bytes(image) for image in images])))
+    return path.name
 
 
 def markdown(results: list[dict[str, Any]]) -> list[str]:
