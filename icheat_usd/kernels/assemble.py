@@ -146,6 +146,15 @@ def _replace_run(first, n, own_view, own, sent):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _add_run(first, n, added_view, own, sent):  # type: ignore[no-untyped-def]
+    """Add the indirect light that some of `n` view samples have besides."""
+    for k in range(np.searchsorted(added_view, first), np.searchsorted(added_view, first + n)):
+        v = np.int64(added_view[k])
+        for c in range(3):
+            sent[v - first, c] += own[v, c]
+
+
+@kernel
 def _add_direct(first, n, direct, indirect, out):  # type: ignore[no-untyped-def]
     """Indirect light, from its address, held at 0 or above, and direct light of `n` view samples to `out`.
 
@@ -233,7 +242,7 @@ def _sum_samples(begin, end, sample_begin, sent, film):  # type: ignore[no-untyp
 
 @kernel
 def _film_chunk(begin, end, table, products, own, direct, seen, in_order, film):  # type: ignore[no-untyped-def]
-    own_view, own_light = own
+    own_view, added_view, own_light = own
     dimmed_view, throughput, sample_begin, _, still_pixel, still = seen
     base = address_of(film)
     first = np.int64(sample_begin[begin])
@@ -242,6 +251,7 @@ def _film_chunk(begin, end, table, products, own, direct, seen, in_order, film):
     indirect = address_of(buffer)
     _indirect_run(first, n, table, products, indirect)
     _replace_run(first, n, own_view, own_light, buffer[: 3 * n].reshape(n, 3))
+    _add_run(first, n, added_view, own_light, buffer[: 3 * n].reshape(n, 3))
     if in_order:
         _add_direct(first, n, direct, indirect, base + 12 * begin)
         _dim(first, n, dimmed_view, throughput, film[begin:end])
@@ -268,8 +278,8 @@ def assemble_film(table, products, own, direct, seen, film):  # type: ignore[no-
     Parameters
     ----------
     own
-        ``(own_view, own_light)``: (n_own,) int32 view samples, ascending, whose indirect light is not interpolated, and
-        theirs, (n_view, 3) float32.
+        ``(own_view, added_view, own_light)``: (n_own,) int32 view samples, ascending, whose indirect light is not
+        interpolated; (n_added,) the same that have some besides; and the light of both, (n_view, 3) float32.
     direct
         ``(kept, lights, gains)``: the sum of the first lights' reflected direct light, (n_view, 3) or (0, 3);
         that of each of the others at gain 1, (n_lights, n_view, 3); and their gains, each 16 times, (n_lights, 48).

@@ -57,6 +57,9 @@ def _find_large(begin, end, index, worth, size, least, number):  # type: ignore[
 @kernel
 def _find_large_pairs(begin, end, index, worth, size, least, number):  # type: ignore[no-untyped-def]
     """Numbers of the pairs of coefficients with a term that is `least` or more, and how many they are."""
+    if least == np.inf:  # the mean alone, which is the first
+        number[0] = begin >> 1
+        return 1 if begin < end and worth[begin] > 0 and size[index[begin]] == np.inf else 0
     count = _find_large(begin, end, index, worth, size, least, number)
     n_pairs, last = 0, np.int32(-1)
     for i in range(count):

@@ -165,6 +165,101 @@ def _add_terms_run(  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
+def soft_terms(  # type: ignore[no-untyped-def]
+    samples,
+    group,
+    term_begin,
+    term_version,
+    term_factor_begin,
+    term_factor,
+    masks,
+    sparse,
+    indptr,
+    indices,
+    weights,
+    pair_of,
+    products,
+    tints,
+    out,
+):
+    """Sum of the terms of each sample into ``out[sample]``, (n_view, 3), where masks alone are factors.
+
+    The parameters are those of `add_terms`.
+    """
+    n = len(samples)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        _soft_terms_run(
+            chunk * _CHUNK,
+            min(n, chunk * _CHUNK + _CHUNK),
+            samples,
+            group,
+            term_begin,
+            term_version,
+            term_factor_begin,
+            term_factor,
+            masks,
+            sparse,
+            indptr,
+            indices,
+            weights,
+            pair_of,
+            products,
+            tints,
+            out,
+        )
+
+
+@kernel
+def _soft_terms_run(  # type: ignore[no-untyped-def]
+    first,
+    end,
+    samples,
+    group,
+    term_begin,
+    term_version,
+    term_factor_begin,
+    term_factor,
+    masks,
+    sparse,
+    indptr,
+    indices,
+    weights,
+    pair_of,
+    products,
+    tints,
+    out,
+):
+    """`soft_terms` for some of the samples."""
+    product_0, tint_0, out_0 = address_of(products), address_of(tints), address_of(out)
+    product_step, tint_step = 1024 * products.shape[1], 12 * tints.shape[1]
+    for k in range(first, end):
+        s = np.int64(samples[k])
+        total = black()
+        for lobe in range(len(products)):
+            tint = load_rgb(tint_0 + lobe * tint_step + 12 * s)
+            if is_black(tint):
+                continue
+            of_lobe = product_0 + lobe * product_step
+            sent = black()
+            for term in range(term_begin[group[s]], term_begin[group[s] + 1]):
+                factor = np.float32(1)
+                for f in range(term_factor_begin[term], term_factor_begin[term + 1]):
+                    factor *= masks[term_factor[f], s]
+                pairs = pair_of[term_version[term]]
+                if sparse == 0:
+                    place = of_lobe + 1024 * np.int64(pairs[s >> 6]) + 16 * (s & 63)
+                    sent = scale_add(load_color(place), factor, sent)
+                else:
+                    for entry in range(indptr[s], indptr[s + 1]):
+                        row = np.int64(indices[entry])
+                        place = of_lobe + 1024 * np.int64(pairs[row >> 6]) + 16 * (row & 63)
+                        sent = scale_add(load_color(place), factor * weights[entry], sent)
+            total = color_add(sent, tint, total)
+        # the light of a sample that begins a line may be written by another thread: three floats, not four
+        store_rgb(out_0 + 12 * s, total)
+
+
+@parallel_kernel
 def signatures(masks, samples, out):  # type: ignore[no-untyped-def]
     """Bits of the rows that touch each sample: whole rows in ``out[:, : n]``, soft ones in ``out[:, n :]``."""
     words = out.shape[1] // 2

@@ -9,7 +9,7 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 
 
 @kernel
-def _haar_of_one(deltas, nodes, child, share, root, out):  # type: ignore[no-untyped-def]
+def _haar_of_one(deltas, nodes, child, share, root, out, size):  # type: ignore[no-untyped-def]
     mean = np.empty((len(nodes), 3))
     for k in range(len(nodes)):
         node = nodes[k]
@@ -23,6 +23,7 @@ def _haar_of_one(deltas, nodes, child, share, root, out):  # type: ignore[no-unt
                 right = mean[place >> 1, c] if place & 1 else np.float64(deltas[place >> 1, c])
             mean[k, c] = share[node, 0] * left + share[node, 1] * right
             out[1 + node, c] = (left - right) * share[node, 2]
+        size[1 + node] = max(abs(out[1 + node, 0]), abs(out[1 + node, 1]), abs(out[1 + node, 2]))
     for c in range(3):
         if len(nodes) > 0:
             out[0, c] = mean[len(nodes) - 1, c] * root
@@ -31,7 +32,9 @@ def _haar_of_one(deltas, nodes, child, share, root, out):  # type: ignore[no-unt
 
 
 @parallel_kernel
-def haar_of_cells(versions, version_cells, deltas, version_nodes, nodes, child, share, root, out):  # type: ignore[no-untyped-def]
+def haar_of_cells(  # type: ignore[no-untyped-def]
+    versions, version_cells, deltas, version_nodes, nodes, child, share, root, out, size
+):
     """Haar coefficients of values that are 0 but at some cells.
 
     Parameters
@@ -45,6 +48,8 @@ def haar_of_cells(versions, version_cells, deltas, version_nodes, nodes, child, 
         Weights of the left and the right mean in the node's, and the factor on their difference.
     root : square root of the total weight
     out : (n_slots, n_leaves, 4) float32
+    size : (n_slots, n_leaves) float32
+        Largest sizes of the channels; the mean's is left alone.
     """
     for index in prange(len(versions)):
         version = versions[index]
@@ -56,6 +61,7 @@ def haar_of_cells(versions, version_cells, deltas, version_nodes, nodes, child, 
             share,
             root,
             out[version],
+            size[version],
         )
 
 
@@ -206,6 +212,45 @@ def _sum_terms(unedited, versions, pair_of, tile, values, out):  # type: ignore[
         value = values[pair_of[version, tile]].reshape(-1)
         for i in range(len(out)):
             out[i] += value[i]
+
+
+@parallel_kernel
+def sum_atoms(pairs, which, pair_tile, begin, atom, factor, pair_of, values):  # type: ignore[no-untyped-def]
+    """``values[:, pair] = sum over the atoms of its version of factor * their products`` with its tile, in order.
+
+    Parameters
+    ----------
+    pairs, which : (n,) int64, pair of tile and version, and the version's place in `begin`
+    pair_tile : (n_pairs,) int32
+    begin : (n_versions + 1,) int64, ranges of `atom` and `factor`
+    atom : (n_terms,) int64, version that an atom is
+    factor : (n_terms, 64) float32, colour and pad, 16 times
+    pair_of : (all versions, n_tiles) int32
+    values : (n_lobes, n_pairs or more, 64, 4) float32
+    """
+    n = len(pairs)
+    for job in prange(n * len(values)):
+        of_lobe, k = values[job // n], job % n
+        v = which[k]
+        _sum_atoms(
+            atom[begin[v] : begin[v + 1]],
+            factor[begin[v] : begin[v + 1]],
+            pair_of,
+            pair_tile[pairs[k]],
+            of_lobe,
+            pairs[k],
+        )
+
+
+@kernel
+def _sum_atoms(atom, factor, pair_of, tile, values, pair):  # type: ignore[no-untyped-def]
+    out = values[pair].reshape(-1)
+    out[:] = np.float32(0)
+    for k in range(len(atom)):
+        value = values[pair_of[atom[k], tile]].reshape(-1)
+        for part in range(4):
+            for i in range(64):
+                out[64 * part + i] += value[64 * part + i] * factor[k, i]
 
 
 @parallel_kernel

@@ -219,7 +219,8 @@ class LiveRelighter:
         self._update()
         edited = np.empty_like(self._base)
         self._shared.edited(edited)
-        edited[self._mixed_samples] = self._own[self._mixed_samples]
+        own = self._own_light
+        edited[own.samples], edited[own.added] = own.light[own.samples], edited[own.added] + own.light[own.added]
         # Held at 0 or above once, at the end, as in the film.
         unedited, edited = (np.maximum(light, np.float32(0)) for light in (self._unedited(), edited))
         return RelitView(np.ascontiguousarray(self.lights.direct(), np.float32), unedited, edited)
@@ -311,7 +312,8 @@ class LiveRelighter:
         self._shared = SharedLight(self._products, self._table)
         self._changed_samples: list[I64] = []
         self._samples_of: dict[frozenset[int], I64] = {}
-        self._mixed: Bool = np.zeros(self.view.n, np.bool_)
+        self._mixed: Bool = np.zeros(self.view.n, np.bool_)  # not all of their light is shared
+        self._soft: Bool = np.zeros(self.view.n, np.bool_)  # but some of it is
         self._alone: Bool = np.zeros(self.view.n, np.bool_)
         self._most_groups = self._most_versions = sys.maxsize
         self._place(np.flatnonzero(self._touched_by(range(len(stack.mask_rows)))))
@@ -351,12 +353,14 @@ class LiveRelighter:
                 needed,
             )
         self._versions.need(needed)
-        self._shared.place(samples, groups, np.append(self._terms.shared, False))
+        self._shared.place(samples, groups, np.append(self._terms.shared | self._terms.is_soft, False))
         group = groups.of_sample[samples]
         self._mixed[samples] = ~np.append(self._terms.shared, True)[group]
+        self._soft[samples] = np.append(self._terms.is_soft, False)[group]
         self._alone[samples] = np.append(self._terms.alone, False)[group]
         self._mixed_samples = np.flatnonzero(self._mixed)
-        self._own_light = OwnLight(self._mixed_samples.astype(np.int32), self._own)
+        whole, soft = (np.flatnonzero(some).astype(np.int32) for some in (self._mixed & ~self._soft, self._soft))
+        self._own_light = OwnLight(whole, soft, self._own)
         alone = np.flatnonzero(self._alone)
         self._alone_samples: AloneSamples | None = None
         self._alone_difference: F32 = np.zeros((self.view.n if len(alone) else 0, 3), np.float32)
@@ -423,7 +427,7 @@ class LiveRelighter:
 
     def _show(self, samples: I64) -> None:
         """Add up what groups share, and find the light of some samples that do not share theirs."""
-        self._shared.add_up(self._terms.light, self._versions)
+        self._shared.add_up(self._terms.alike, self._versions)
         self._edit(samples)
 
     def _unedited(self) -> F32:
@@ -463,8 +467,13 @@ class LiveRelighter:
         return self._by_group[0] if len(self._by_group) == 1 else self._by_group.sum(axis=0)
 
     def _edit(self, samples: I64) -> None:
-        """Find the light of those of some samples that do not share theirs."""
+        """Find the light of those of some samples that do not share all of theirs."""
         samples = samples[self._mixed[samples]] if len(self._mixed_samples) else samples[:0]
+        is_soft = self._soft[samples]
+        if is_soft.any():
+            soft = samples if is_soft.all() else samples[is_soft]
+            self._terms.add_soft(soft, self._stack.receiver_masks, self._products, self._own)
+            samples = samples[~is_soft]
         if not len(samples):
             return
         light = np.take(self._unedited(), samples, axis=0)

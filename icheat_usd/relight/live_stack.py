@@ -360,12 +360,15 @@ def _same_structure(a: Edit, b: Edit, bound: BoundEdit) -> bool:
 
 
 def _same_baked(a: Edit, b: Edit) -> bool:
-    """Whether two edits of an unknown operation have the same rows and numbers."""
-    names = ("rows", "scale_delta", "emission", "offset")
-    return all(
-        x is y or (x is not None and y is not None and all(getattr(x, name) is getattr(y, name) for name in names))
-        for x, y in zip(_payloads(a), _payloads(b), strict=True)
-    )
+    """Whether two edits of an unknown operation have the same rows and numbers; rows know their masks."""
+
+    def same(x: Payload | None, y: Payload | None) -> bool:
+        if x is None or y is None:
+            return x is y
+        names = ["rows", "scale_delta", "emission", "offset"] + ["receiver_mask", "caster_mask"] * (x.rows is not None)
+        return all(getattr(x, name) is getattr(y, name) for name in names)
+
+    return all(same(x, y) for x, y in zip(_payloads(a), _payloads(b), strict=True))
 
 
 def _acts_as(before: BoundEdit, now: BoundEdit) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -20,10 +21,18 @@ class PointsByInstance:
         self._order = np.argsort(points.instance, kind="stable").astype(np.int64)
         n_instances = int(points.instance.max(initial=-1)) + 1
         self._begin = np.searchsorted(points.instance[self._order], np.arange(n_instances + 1))
+        # Edits of the same surfaces share them while one of them is shown.
+        self._found: WeakValueDictionary[bytes, I64] = WeakValueDictionary()
 
     def on(self, on_instances: F32) -> I64:
-        """Points, ascending, on instances whose weight (n_instances,) is not 0."""
+        """Points, ascending, on instances whose weight (n_instances,) is not 0; not to be written to."""
         some = np.flatnonzero(on_instances[: len(self._begin) - 1])
+        found = self._found.get(some.tobytes())
+        if found is None:
+            self._found[some.tobytes()] = found = self._on(some)
+        return found
+
+    def _on(self, some: I64) -> I64:
         parts = [self._order[self._begin[i] : self._begin[i + 1]] for i in some]
         parts = [part for part in parts if len(part)]
         if len(parts) < 2:

@@ -58,7 +58,7 @@ class VersionTables(NamedTuple):
 class _Tiles:
     """Packed rows of all lobes as kernels read them."""
 
-    def __init__(self, rows: list[PackedRows]) -> None:
+    def __init__(self, rows: list[PackedRows], narrow_of: _Tiles | None = None) -> None:
         parts = [
             pair_coefficients(of_lobe.tile_begin, of_lobe.index, of_lobe.scale, of_lobe.worth, of_lobe.value)  # type: ignore[arg-type]
             for of_lobe in rows
@@ -66,20 +66,27 @@ class _Tiles:
         self.n_tiles = rows[0].n_tiles
         self.n_lobes = len(rows)
         self._tiles: PairedTiles = join_tiles(parts)
+        # Also of what is narrower, so that nothing that was there before stays.
+        self._is_empty: Bool = np.diff(self._tiles.tile_begin) == 0 if narrow_of is None else narrow_of._is_empty
 
     def multiply(self, versions: F32, size: F32, least: F32, tile: I32, version: I32, place: I64, out: F32) -> None:
-        """Products of pairs of tile and version, to ``out[:, place]`` (n_lobes, n, 64, 4); `least` may be empty."""
+        """Products of pairs of tile and version, to ``out[:, place]`` (n_lobes, n, 64, 4); `least` may be empty.
+
+        Where a lobe has no coefficients, `out` stays as it is: 0.
+        """
         assert out.flags.c_contiguous  # a copy would be written to, and lost
         lobe = np.repeat(np.arange(self.n_lobes), len(tile))
         several = (self.n_lobes,)
+        tiles = np.tile(tile, several) + self.n_tiles * lobe
+        some = np.flatnonzero(~self._is_empty[tiles])
         multiply_terms(
             *self._tiles,
             versions,
             size,
             least,
-            (np.tile(tile, several) + self.n_tiles * lobe).astype(np.int32),
-            np.tile(version, several),
-            (np.tile(place, several) + out.shape[1] * lobe).astype(np.int32),
+            tiles[some].astype(np.int32),
+            np.tile(version, several)[some],
+            (np.tile(place, several) + out.shape[1] * lobe)[some].astype(np.int32),
             out.reshape(-1, LANES, 4),
         )
 
@@ -145,7 +152,7 @@ class Products:
         sizes = np.abs(self._versions[:n_versions]).max(axis=(0, 2), initial=0.0)
         for light in lights:
             np.maximum(sizes, np.abs(haar_of_versions(self._plan, light[None])).max(axis=(0, 2)), out=sizes)
-        self._narrow = _Tiles([lobe.rows for lobe in self._packed.narrowed(sizes, max_bytes).lobes])
+        self._narrow = _Tiles([lobe.rows for lobe in self._packed.narrowed(sizes, max_bytes).lobes], self._tiles)
 
     def widen(self) -> None:
         """Forget the narrowed rows."""
@@ -153,7 +160,9 @@ class Products:
 
     def clear(self, version: int | None = None) -> None:
         """Forget one version, or all."""
-        self._versions[slice(None) if version is None else version] = 0
+        some = slice(None) if version is None else version
+        self._versions[some] = 0
+        self._sizes[some] = 0
 
     def keep(self, versions: I64) -> None:
         """Forget all but some versions (ascending), and number these anew, in their order."""
@@ -162,6 +171,7 @@ class Products:
             for new, old in enumerate(versions):
                 values[new] = values[old]
         self._versions[n:] = 0
+        self._sizes[n:] = 0
 
     def reserve(self, n_versions: int) -> None:
         """Have place for so many versions."""
@@ -204,6 +214,7 @@ class Products:
                 self._share,
                 self._root,
                 self._versions,
+                self._sizes,
             )
         # A few at a time: what lies between the two steps stays in the cache.
         for first in range(0, len(versions[large]), _TOGETHER):
@@ -211,7 +222,7 @@ class Products:
             values = self._leaves[: len(some)]
             kernels.fill_versions(some, tables.cell_begin, tables.cells, deltas, values)
             haar_of_versions(self._plan, values, self._versions, some)
-        largest_channels(versions, self._versions, self._sizes)
+        largest_channels(versions[large], self._versions, self._sizes)
         self._sizes[versions, 0] = np.inf  # means stay, however dark they are
 
     def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:

@@ -23,7 +23,8 @@ from icheat_usd.transport.packed import LANES
 class OwnLight(NamedTuple):
     """Indirect light that samples do not share with a group; see `assemble_film`."""
 
-    samples: I32  #: ascending
+    samples: I32  #: ascending; all of theirs
+    added: I32  #: ascending; besides what they share with a group
     light: F32  #: (n_view, 3)
 
 
@@ -49,7 +50,7 @@ def seen_samples(view: ViewSamples) -> SeenSamples:
 
 
 class SharedLight:
-    """Sums of products by group and tile, for groups whose samples all receive the same terms.
+    """Sums of products by group and tile, of the terms that all samples of a group receive alike.
 
     The table that the edited image is interpolated with names these sums
     instead of the unedited products, so that an edit costs a pixel nothing.

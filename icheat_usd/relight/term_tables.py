@@ -23,6 +23,9 @@ class TermTables:
         compiled = stack.compiled
         self.aggregates = np.flatnonzero(compiled.way == Way.AGGREGATE)  #: rows of the stack
         self.light = _EMPTY
+        self.alike = _EMPTY  #: of those, what all samples of a group receive alike; nothing of groups that are mixed
+        self.soft = _EMPTY  #: what is left of groups whose other terms have no factors but masks
+        self.is_soft: Bool = np.zeros(0, np.bool_)  #: (n_groups,) whether something is
         self.seen: list[TermTable] = [_EMPTY] * len(self.aggregates)  #: by aggregate
         self.reach: list[TermTable] = [_EMPTY] * len(self.aggregates)  #: by aggregate
         self.alone: Bool = np.zeros(0, np.bool_)  #: (n_groups,) evaluated pair by pair
@@ -45,7 +48,15 @@ class TermTables:
         self.alone = np.append(self.alone, [terms.alone for terms in groups]).astype(np.bool_)
         shared = [self._is_shared(terms) for terms in groups]
         self.shared = np.append(self.shared, shared).astype(np.bool_)
+        is_soft = [self._is_soft(terms) for terms in groups]
+        self.is_soft = np.append(self.is_soft, is_soft).astype(np.bool_)
         self.light = self._more(self.light, [terms.light for terms in groups])
+        alike, soft = [], []
+        for terms, *either in zip(groups, shared, is_soft, strict=True):
+            some = terms.light if any(either) else ()
+            alike.append(tuple(term for term in some if not term.factors))
+            soft.append(tuple(term for term in some if term.factors))
+        self.alike, self.soft = self._more(self.alike, alike), self._more(self.soft, soft)
         seen: list[dict[int, tuple[Term, ...]]] = [dict(terms.seen) for terms in groups]
         for k, row in enumerate(self.aggregates.tolist()):
             self.seen[k] = self._more(self.seen[k], [terms.get(row, ()) for terms in seen])
@@ -89,6 +100,27 @@ class TermTables:
             out,
         )
 
+    def add_soft(self, samples: I64, masks: F32, products: Products, out: F32) -> None:
+        """Light of samples of groups that are soft, besides what they share; see `kernels.terms.soft_terms`."""
+        spread, versions, table = products.interpolation, self._versions, self.soft
+        kernels.soft_terms(
+            samples,
+            self._groups.of_sample,
+            table.term_begin,
+            table.term_version,
+            table.factor_begin,
+            table.factor,
+            masks,
+            products.is_sparse,
+            spread.indptr,
+            spread.indices,
+            spread.weights,
+            versions.pair_of,
+            versions.values,
+            products.tints,
+            out,
+        )
+
     def _more(self, table: TermTable, terms: Sequence[tuple[Term, ...]]) -> TermTable:
         """A table with more groups at the end."""
         flat = [term for group in terms for term in group]
@@ -103,9 +135,20 @@ class TermTables:
         )
 
     def _is_shared(self, terms: GroupTerms) -> bool:
-        if terms.alone or terms.view or terms.seen or any(term.factors for term in terms.light):
+        return self._is_by_products(terms) and not any(term.factors for term in terms.light)
+
+    def _is_soft(self, terms: GroupTerms) -> bool:
+        factors = {member for term in terms.light for member in term.factors}
+        aggregates = set(self.aggregates.tolist())
+        of_masks = all(member < self._compiled.n_rows and member not in aggregates for member in factors)
+        return bool(factors) and of_masks and self._is_by_products(terms)
+
+    def _is_by_products(self, terms: GroupTerms) -> bool:
+        """Whether all light comes by products."""
+        if terms.alone or terms.view or terms.seen:
             return False
-        return not any(self._compiled.gives_offset[list(term.version.whole)].any() for term in terms.light)
+        rows = [row for term in terms.light for row in (*term.version.whole, *term.factors)]
+        return not self._compiled.gives_offset[[row for row in rows if row < self._compiled.n_rows]].any()
 
     def _factor(self, member: int) -> int:
         """Where `add_terms` finds the factor of a member: in the masks, or among what aggregates came to."""

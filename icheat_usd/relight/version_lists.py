@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.kernels.versions import version_deltas
 from icheat_usd.relight.compiled import CompiledStack, Way
 from icheat_usd.relight.growing import Growing
 from icheat_usd.relight.products import Products, VersionTables
@@ -21,6 +23,7 @@ class VersionKey(NamedTuple):
     differ: tuple[int, ...] = ()  #: members of the stack, ascending; empty: the difference to unedited light
     restrict: int = -1  #: count the casters and lights of this aggregate's row alone
     reach: bool = False  #: the casters' weights, not their light
+    cells: bytes = b""  #: of an atom, which is the light of some cells: what tells them from others
 
 
 class Version(NamedTuple):
@@ -56,6 +59,54 @@ def made_version(key: VersionKey, compiled: CompiledStack, products: Products) -
     return Version(key, cells, nodes, child, sets, sign, restrict, rows, by_pairs)
 
 
+def evaluate(
+    pieces: I64,
+    changed_rows: U8,
+    tables: VersionTables,
+    compiled: CompiledStack,
+    light: F32,
+    area: F32,
+    cells: I32,
+    deltas: F32,
+    offsets: F64,
+) -> None:
+    """Differences that versions make to the light of some cells; see `kernels.versions.version_deltas`."""
+    version_deltas(
+        pieces,
+        changed_rows,
+        tables.set_begin,
+        tables.sign,
+        tables.sets,
+        tables.restrict,
+        compiled.run_of,
+        compiled.looks_at,
+        compiled.cell_begin,
+        compiled.entry_row,
+        compiled.entry_weight,
+        compiled.entry_slot,
+        compiled.slots,
+        compiled.row_table,
+        compiled.row_amount,
+        compiled.groups,
+        light,
+        area,
+        cells,
+        deltas,
+        offsets,
+    )
+
+
+def key_of_atom(cells: I32) -> VersionKey:
+    """Key of the light of some cells."""
+    return VersionKey((), cells=hashlib.blake2b(cells.tobytes(), digest_size=16).digest())
+
+
+def made_atom(key: VersionKey, cells: I32, n_members: int, products: Products) -> Version:
+    """The light of some cells as a version."""
+    sets = np.zeros((1, n_members), np.uint8)
+    return Version(key, cells, *products.nodes(cells), sets, np.ones(1), (-1, False, False, False), frozenset(), False)
+
+
 def moved_version(version: Version, compiled: CompiledStack, now: I64) -> Version | None:
     """A version whose rows have other numbers, `now` by row; None if one is gone, or they are in another order."""
     old = sorted(version.rows)
@@ -66,7 +117,9 @@ def moved_version(version: Version, compiled: CompiledStack, now: I64) -> Versio
     whole, differ = (tuple(number[row] for row in some) for some in (version.key.whole, version.key.differ))
     sets = np.zeros((len(version.sets), len(compiled.edit_of)), np.uint8)
     sets[:, rows] = version.sets[:, old]
-    return version._replace(key=VersionKey(whole, differ), sets=sets, rows=frozenset(number.values()))
+    return version._replace(
+        key=VersionKey(whole, differ, cells=version.key.cells), sets=sets, rows=frozenset(number.values())
+    )
 
 
 def _inner(key: VersionKey, compiled: CompiledStack) -> list[int]:

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from icheat_usd.kernels import versions as kernels
 from icheat_usd.kernels.residuals import add_version_residuals, proportions
+from icheat_usd.relight.atoms import Atoms, AtomSums, find_atoms
 from icheat_usd.relight.compiled import CompiledStack
 from icheat_usd.relight.growing import Growing
 from icheat_usd.relight.pair_products import PairProducts, PairSum
@@ -17,6 +17,9 @@ from icheat_usd.relight.version_lists import (
     Version,
     VersionKey,
     VersionLists,
+    evaluate,
+    key_of_atom,
+    made_atom,
     made_version,
     moved_version,
 )
@@ -35,7 +38,9 @@ class Versions:
     """The versions that groups of receivers ask for, and for each the tiles of rows that some receiver needs.
 
     Numbers of versions and pairs depend on the order in which they were asked
-    for; values do not.
+    for; values do not. Versions of edits that multiply are sums over atoms,
+    which are versions themselves: their products follow from those, and
+    another amount needs no product at all.
     """
 
     def __init__(self, compiled: CompiledStack, products: Products, pairs: PairProducts | None, area: F32) -> None:
@@ -55,6 +60,9 @@ class Versions:
         self._pairs = PairLists(products)
         self._light: F32 | None = None
         self._changed_rows: U8 = np.zeros(1 + compiled.n_rows, np.uint8)
+        self._atoms: Atoms = find_atoms(compiled)
+        self._sums = AtomSums(area)
+        self._unsummed: set[int] = set()  # sums over atoms that have to be made anew
         products.clear()
 
     @property
@@ -86,18 +94,68 @@ class Versions:
     def number(self, key: VersionKey) -> int:
         """Number of a version, which is made if it is new."""
         if key not in self._number:
-            self._number[key] = v = len(self._versions)
-            version = made_version(key, self._compiled, self._products)
-            self._versions.append(version)
-            self._lists.append(version)
-            self._delta.extend(len(version.cells))
-            self._offset.extend(1)
-            self._pairs.add_version()
-            self._products.reserve(v + 1)
-            # A new version knows nothing yet: it has to be evaluated at all of its cells.
-            self._changed_rows[0] = 1
-            self._stale.add(v)
+            v = self._add(made_version(key, self._compiled, self._products))
+            self._divide(v)
         return self._number[key]
+
+    def _add(self, version: Version) -> int:
+        self._number[version.key] = v = len(self._versions)
+        self._versions.append(version)
+        self._lists.append(version)
+        self._delta.extend(len(version.cells))
+        self._offset.extend(1)
+        self._pairs.add_version()
+        self._products.reserve(v + 1)
+        # A new version knows nothing yet: it has to be evaluated at all of its cells.
+        self._changed_rows[0] = 1
+        self._stale.add(v)
+        return v
+
+    def _divide(self, v: int) -> None:
+        """Let a version be a sum over the present atoms if it can be, else one of its own."""
+        version = self._versions[v]
+        if version is None or version.key.cells:
+            return
+        atoms = self._atoms.of_version(version)
+        if atoms is None:
+            if v in self._sums.atoms:
+                self._sums.drop(v)
+                self._unsummed.discard(v)
+                self._stale.add(v)
+                self._changed_rows[0] = 1
+            return
+        n_members = len(self._compiled.edit_of)
+        numbers = []
+        for atom in atoms:
+            cells = self._atoms.cells(int(atom))
+            key = key_of_atom(cells)
+            if key not in self._number:
+                self._add(made_atom(key, cells, n_members, self._products))
+            numbers.append(self._number[key])
+        self._sums.put(v, np.array(numbers, np.int64), self._atoms.first[atoms])
+        for some in (self._stale, self._refined, self._known):
+            some.discard(v)
+        self._unsummed.add(v)
+
+    def _find_atoms(self) -> None:
+        """Divide the versions anew; atoms that none needs are given up."""
+        self._atoms = find_atoms(self._compiled)
+        for v in range(self.n):
+            self._divide(v)
+        used = {int(a) for some in self._sums.atoms.values() for a in some}
+        for a, version in enumerate(self._versions):
+            if version is not None and version.key.cells and a not in used:
+                del self._number[version.key]
+                self._give_up(a)
+        self.need(np.zeros((self.n, self._products.n_tiles), np.uint8))
+
+    def _give_up(self, v: int) -> None:
+        self._versions[v] = None
+        self._pairs.drop(v)
+        self._products.clear(v)
+        self._sums.drop(v)
+        for some in (self._stale, self._refined, self._known, self._unsummed):
+            some.discard(v)
 
     def restructured(self, compiled: CompiledStack, before: I64, n_before: int) -> None:
         """Go on with a stack of other rows and no aggregates; versions of rows that stay, in their order, stay.
@@ -115,23 +173,23 @@ class Versions:
         for v, version in enumerate(self._versions):
             if version is None:
                 continue
-            self._versions[v] = moved = moved_version(version, compiled, now)
-            if moved is not None:
-                self._number[moved.key] = v
+            moved = moved_version(version, compiled, now)
+            if moved is None:
+                self._give_up(v)
                 continue
-            self._pairs.drop(v)
-            self._products.clear(v)
-            for some in (self._stale, self._refined, self._known):
-                some.discard(v)
+            self._versions[v] = moved
+            self._number[moved.key] = v
         self._lists.rewrite_sets(self._versions, len(compiled.edit_of))
         self._exact_of = -1
         # What was to be evaluated at some cells alone is evaluated at all of them.
         was_changed = bool(self._changed_rows.any())
         self._changed_rows = np.zeros(1 + compiled.n_rows, np.uint8)
         self._changed_rows[0] = was_changed
+        self._find_atoms()
 
     def keep(self, needed: set[int]) -> None:
         """Forget all but some versions, and number these anew, in their order."""
+        needed = needed.union(*(self._sums.atoms[v].tolist() for v in needed & self._sums.atoms.keys()))
         kept = np.array(sorted(needed), np.int64)
         number = {int(v): k for k, v in enumerate(kept)}
         parts = [self._lists.part(int(v)) for v in kept]
@@ -149,9 +207,10 @@ class Versions:
         pairs = self._pairs.keep(kept)
         if self._known_values.shape[1]:
             self._known_values = np.ascontiguousarray(self._known_values[:, pairs])
-        self._stale, self._refined, self._known = (
-            {number[v] for v in some & needed} for some in (self._stale, self._refined, self._known)
+        self._stale, self._refined, self._known, self._unsummed = (
+            {number[v] for v in some & needed} for some in (self._stale, self._refined, self._known, self._unsummed)
         )
+        self._sums.renumber(number)
         self._exact_of = -1
         self._products.keep(kept)
         if self._pair_products is not None:
@@ -161,14 +220,19 @@ class Versions:
         """Go on with another stack of the same structure, of which some rows act differently, some on other casters."""
         self._compiled = compiled
         # A difference on other casters has little in common with what it was.
+        painted = set(painted)
         self._known -= {v for v in self._known if not self._rows_of(v).isdisjoint(painted)}
         changed = set(rows)
         if changed:
             self._changed_rows[1 + np.array(sorted(changed))] = 1
             stale = {v for v in range(self.n) if self._rows_of(v) & changed}
+            self._unsummed |= stale & self._sums.atoms.keys()
+            stale -= self._sums.atoms.keys()
             self._stale |= stale
             if self._pair_products is not None:
                 self._pair_products.stack_changed(stale)
+            if painted or not self._atoms.still_hold(compiled, changed):
+                self._find_atoms()
 
     def forget_products(self) -> None:
         """Multiply all of the differences anew."""
@@ -178,12 +242,17 @@ class Versions:
     def light_changed(self, b: F32) -> None:
         """Take other light, (G, n_gather, 3)."""
         self._light = b
-        self._stale = {v for v, version in enumerate(self._versions) if version is not None}
+        sums = self._sums.atoms.keys()
+        self._stale = {v for v, version in enumerate(self._versions) if version is not None and v not in sums}
+        self._unsummed = set(sums)
         self._changed_rows[0] = 1
 
     def need(self, needed: U8) -> None:
         """Have products for pairs of versions and tiles, (n_versions, n_tiles) flags, from the next update on."""
-        version, tile = np.nonzero((needed != 0) & (self.pair_of < 0))
+        there = needed != 0
+        for v, atoms in self._sums.atoms.items():
+            there[atoms] |= there[v] | (self.pair_of[v] >= 0)
+        version, tile = np.nonzero(there & (self.pair_of < 0))
         if not len(version):
             return
         fresh = self._pairs.add(version, tile)
@@ -193,16 +262,21 @@ class Versions:
             self._known_values = self._products.room(0)
         some = set(version.tolist())
         # What was prepared of known ones is their rest alone.
+        self._unsummed |= some & self._sums.atoms.keys()
         self._stale |= {v for v in some if self._is_by_pairs(v)} | (some & self._known)
         self._refined -= some
         self._exact_of = -1
         self._known -= some
         # Those whose version is evaluated anyway are multiplied then.
-        done = ~np.isin(version, list(self._stale))
+        done = ~np.isin(version, list(self._stale | self._unsummed))
         self._multiply(fresh[done])
 
     def update(self) -> None:
         """Evaluate what has changed since the last time."""
+        self._evaluate()
+        self._add_up()
+
+    def _evaluate(self) -> None:
         if not self._stale:
             return
         assert self._light is not None
@@ -211,28 +285,8 @@ class Versions:
         pieces = _pieces(stale, tables.cell_begin)
         compiled = self._compiled
         sums = np.zeros((len(pieces), 6))
-        kernels.version_deltas(
-            pieces,
-            self._changed_rows,
-            tables.set_begin,
-            tables.sign,
-            tables.sets,
-            tables.restrict,
-            compiled.run_of,
-            compiled.looks_at,
-            compiled.cell_begin,
-            compiled.entry_row,
-            compiled.entry_weight,
-            compiled.entry_slot,
-            compiled.slots,
-            compiled.row_table,
-            compiled.row_amount,
-            compiled.groups,
-            self._light,
-            self._area,
-            tables.cells,
-            self._deltas,
-            sums,
+        evaluate(
+            pieces, self._changed_rows, tables, compiled, self._light, self._area, tables.cells, self._deltas, sums
         )
         if compiled.field.has_offset:
             self.offsets[stale] = 0
@@ -258,6 +312,12 @@ class Versions:
         self._exact_of = -1
         self._stale = set()
         self._changed_rows[:] = 0
+
+    def _add_up(self) -> None:
+        """Make the products of versions that are sums over atoms."""
+        if self._unsummed:
+            self._sums.add_up(sorted(self._unsummed), self._lists.tables, self._compiled, self._pairs)
+        self._unsummed = set()
 
     def _pairs_of_some(self, versions: I64) -> I64:
         return np.concatenate([np.empty(0, np.int64), *(self._pairs.of_version[v] for v in versions)])
@@ -290,13 +350,18 @@ class Versions:
     def refine(self, exact: Products) -> bool:
         """Multiply some pairs with exact rows that were multiplied with packed ones; False when none is left."""
         self.update()
+        more = self._refine(exact)
+        self._add_up()
+        return more
+
+    def _refine(self, exact: Products) -> bool:
         tables = self._lists.tables
         narrow = self._products.is_narrow
         n_done = 0
         for v, version in enumerate(self._versions):
             pairs = self._pairs.of_version[v]
             known = v in self._refined and (v in self._known or not narrow)
-            if version is None or version.by_pairs or known or not len(pairs):
+            if version is None or version.by_pairs or known or not len(pairs) or v in self._sums.atoms:
                 continue
             if n_done == _PAIRS_AT_ONCE:
                 return True
@@ -314,6 +379,7 @@ class Versions:
                 self._learn(v, self._exact)
             self.values[:, pairs] = self._exact
             self._refined.add(v)
+            self._unsummed |= self._sums.with_some(v)
         return False
 
     def _learn(self, v: int, exact: F32) -> None:

@@ -84,6 +84,8 @@ def test_film_adds_direct_light_and_what_stays(samples: str, n_kept: int) -> Non
     own = colors(n, 3) - np.float32(0.5)
     indirect = expected_view(rows, products, tint)
     indirect[own_view] = own[own_view]
+    added_view = np.setdiff1d(rng.choice(n, 300, replace=False), own_view).astype(np.int32)
+    indirect[added_view] += own[added_view]
     indirect = np.maximum(indirect, 0)
     sent = indirect + (gains[:, None].astype(np.float64) * direct).sum(axis=0)
     expected = np.zeros((n_pixels, 3))
@@ -98,7 +100,7 @@ def test_film_adds_direct_light_and_what_stays(samples: str, n_kept: int) -> Non
         for n_threads in (1, before):
             numba.set_num_threads(n_threads)
             film = np.full((n_pixels, 3), np.nan, np.float32)
-            edited = (own_view, own)
+            edited = (own_view, added_view, own)
             seen = (dimmed_view, throughput[dimmed_view], begin, chunks_in_order(begin), still_pixel, still)
             assemble_film(tuple(table_of(rows, tint)), products, edited, summed, seen, film)
             films.append(film)
@@ -120,7 +122,7 @@ def test_what_is_kept_of_direct_light_does_not_show_in_the_bits() -> None:
     nothing = np.zeros(0, np.int32)
     begin = np.arange(2501, dtype=np.int32)
     seen = (nothing, np.zeros((0, 3), np.float32), begin, chunks_in_order(begin), nothing, np.zeros((0, 3), np.float32))
-    own = (nothing, np.zeros((0, 3), np.float32))
+    own = (nothing, nothing, np.zeros((0, 3), np.float32))
     rows, tint = interpolation(np.full(2500, 3, np.int32)), colors(1, 2500, 3)
     table, products = tuple(table_of(rows, tint)), colors(1, N_ROWS, 4)
     expected = np.empty((2500, 3), np.float32)

@@ -350,7 +350,7 @@ def measure_frame(
     still = np.flatnonzero(view.background.any(axis=1)).astype(np.int32)
     background = np.ascontiguousarray(view.background[still])
     film = np.empty((n_pixels, 3), np.float32)
-    unedited = (np.zeros(0, np.int32), np.zeros((0, 3), np.float32))
+    unedited = (np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32))
     seen = (dimmed, view.throughput[dimmed], sample_begin, chunks_in_order(sample_begin), still, background)
 
     def haar() -> None:
