@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.edits.offsets import offset_radiance
-from icheat_usd.final_gather.edited_records import MOST_SOFT, EditedRecords, RecordPairs, soft_masks
+from icheat_usd.final_gather.edited_records import EditedRecords
 from icheat_usd.final_gather.gatherer import (
     GatheredLight,
     Gatherer,
@@ -17,11 +17,11 @@ from icheat_usd.final_gather.gatherer import (
     light_of_pairs,
     relit,
     specular_lobe,
-    touched_receivers,
 )
+from icheat_usd.final_gather.hemispheres import Hemispheres, Part
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, Places
 from icheat_usd.final_gather.light_parts import light_of_records
-from icheat_usd.final_gather.record_rays import RecordRays, take_rays
+from icheat_usd.final_gather.receiver_sets import MOST_SOFT, soft_masks, touched
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
@@ -47,13 +47,10 @@ class CachedGather:
         self._is_kept = is_kept
         self.samples: list[Sampled] = []
         self._parts = CachedParts(gatherer.parts, cache)
+        self.hemispheres = hemispheres_of(cache)
+        self._parts.take_edits(self.hemispheres)
         stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
-        self._stacks: list[tuple[Gatherer, EditedRecords]] = []
-        known = None
-        for stack in stacks:
-            records = EditedRecords(stack, cache, known)
-            known = records.by_caster or known
-            self._stacks.append((stack, records))
+        self._stacks = [(stack, EditedRecords(stack, cache, self.hemispheres)) for stack in stacks]
 
     def light(self, places: Places, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
         """Radiance towards the eye; points that no edit touches have the same bits in both results."""
@@ -79,7 +76,16 @@ class CachedGather:
         shiny = specular_lobe(self._gatherer, points, to_eye, stream, self._glossy_rays, seed)
         if shiny is not None:
             base[shiny.where] += shiny.mean()
-        return Sampled(points, stream, seed, found, base, shiny, alone, own_rays)
+        own = None
+        if own_rays is not None:
+            some = Part(own_rays, take_points(points, alone), np.arange(len(alone)))
+            own = Hemispheres([some], np.ones(len(alone), np.float32))
+        return Sampled(points, stream, seed, found, base, shiny, alone, own)
+
+
+def hemispheres_of(cache: IrradianceCache) -> Hemispheres:
+    """Rays of a cache's records, none if it keeps none."""
+    return Hemispheres([Part(*part) for part in cache.parts], cache.shrink)
 
 
 class Sampled(NamedTuple):
@@ -92,52 +98,52 @@ class Sampled(NamedTuple):
     base: F32
     shiny: Lobe | None
     alone: I64  #: (k,) ascending, samples without records
-    own_rays: RecordRays | None  #: of these
+    own_rays: Hemispheres | None  #: of these
 
 
 def under_stack(g: Gatherer, records: EditedRecords, sampled: Sampled) -> F32:
     """Light of camera samples under the stack of a gatherer, (n, 3); where no edit acts the bits of `base`."""
     points, base, shiny = sampled.points, sampled.base, sampled.shiny
     edited = base.copy()
-    receivers, touched = touched_receivers(g.field, points)
-    if len(touched) == 0:
+    receivers = touched(g.field, points)
+    where = receivers.where
+    if len(where) == 0:
         return edited
     # Curves, light from behind occluders, and mixtures of too many soft masks look at pairs of their own; the
     # cache corrects what their few rays brought.
-    has_records = sampled.found.number[touched] > 0
-    by_pairs = has_records & (soft_masks(receivers.masks) > MOST_SOFT)
+    has_records = sampled.found.number[where] > 0
+    by_pairs = has_records & (soft_masks(receivers.columns) > MOST_SOFT)[receivers.which]
     if g.field.aggregates or g.field.throughs:
         by_pairs[:] = True
     lobes = [] if shiny is None else [shiny]
-    light = np.empty((len(touched), 3), np.float32)
-    which = touched[by_pairs]
+    light = np.empty((len(where), 3), np.float32)
+    which = where[by_pairs]
     if len(which):
         own = diffuse_lobe(g, points, which, sampled.stream, int(hash_combine(sampled.seed, 23)))
         brought = _brought(len(base), [own, *lobes])
-        some = receivers.take(np.flatnonzero(by_pairs))
-        light[by_pairs] = light_of_pairs(g, some, which, [own, *lobes], points.albedo)
+        ends = receivers.take(np.flatnonzero(by_pairs)).ends()
+        light[by_pairs] = light_of_pairs(g, ends, which, [own, *lobes], points.albedo)
         light[by_pairs] += base[which] - brought[which]
     rest = np.flatnonzero(~by_pairs)
     if len(rest):
-        where, some = touched[rest], receivers.take(rest)
+        some = receivers.take(rest)
+        at = some.where
         change = np.empty((len(rest), 3), np.float32)
-        near = np.flatnonzero(has_records[rest])
-        at = where[near]
-        change[near] = records.change(
-            sampled.found.take(at), points.position[at], points.shading_normal[at], some.masks[:, near]
-        )
-        lost = np.flatnonzero(~has_records[rest])
-        if len(lost) and sampled.own_rays is not None:
-            rows = np.searchsorted(sampled.alone, where[lost])
-            pairs = RecordPairs(g, take_rays(sampled.own_rays, rows), take_points(points, where[lost]))
-            change[lost] = np.pi * pairs.change(np.arange(len(lost)), some.masks[:, lost]).mean(axis=1)
-        light[rest] = base[where] + points.albedo[where] * (change * _INVERSE_PI)
+        near, lost = np.flatnonzero(has_records[rest]), np.flatnonzero(~has_records[rest])
+        if len(near):
+            change[near] = records.change(sampled.found, points, some.take(near))
+        if len(lost):
+            assert sampled.own_rays is not None
+            rows = np.searchsorted(sampled.alone, at[lost])
+            change[lost] = records.change_alone(points, sampled.own_rays, rows, some.take(lost))
+        albedo = np.take(points.albedo, at, axis=0)
+        light[rest] = np.take(base, at, axis=0) + albedo * (change * _INVERSE_PI)
         if shiny is not None:
-            reflected = light_of_pairs(g, some, where, lobes, points.albedo, with_offsets=False)
-            light[rest] += reflected - _brought(len(base), lobes)[where]
+            reflected = light_of_pairs(g, some.ends(), at, lobes, points.albedo, with_offsets=False)
+            light[rest] += reflected - _brought(len(base), lobes)[at]
         if g.solution is not None and g.solution.offsets is not None:
-            light[rest] += offset_radiance(g.field, g.solution.offsets, some, points.albedo[where])
-    edited[touched] = g.field.finish(light, receivers, is_part=g.is_part)
+            light[rest] += offset_radiance(g.field, g.solution.offsets, some.ends(), albedo)
+    edited[where] = g.field.finish(light, receivers.ends(), is_part=g.is_part)
     return edited
 
 
@@ -163,7 +169,13 @@ class CachedParts:
         cells = np.concatenate(sent, axis=1)
         self._cells = np.concatenate([cells, np.zeros((1, cells.shape[1]), np.float32)])
         self._values = light_of_records(cache, self._cells)
-        self._records = [None if part.field.is_identity else EditedRecords(part, cache) for part in parts]
+        self._records: list[EditedRecords | None] = [None for _ in parts]
+
+    def take_edits(self, hemispheres: Hemispheres) -> None:
+        """Edit the light of the parts, too."""
+        for number, part in enumerate(self._parts):
+            if not part.field.is_identity:
+                self._records[number] = EditedRecords(part, self._cache, hemispheres)
 
     def light(self, sampled: Sampled, whole: F32) -> tuple[tuple[F32, F32], ...]:
         """Radiance towards the eye, without edits and with them, of each part; `whole` is the edited light of all."""
@@ -189,7 +201,7 @@ class CachedParts:
         points, alone = sampled.points, sampled.alone
         light = self._cache.interpolate(sampled.found, points.position, points.shading_normal, self._values)
         if sampled.own_rays is not None:
-            light[alone] = np.pi * sampled.own_rays.radiance(self._cells).mean(axis=1)
+            light[alone] = np.pi * sampled.own_rays.parts[0].rays.radiance(self._cells).mean(axis=1)
         parts = light.reshape(len(light), len(self._parts), 3).transpose(1, 0, 2)
         wanted, positive = np.maximum(parts.sum(axis=0), 0), np.maximum(parts, 0)
         there = positive.sum(axis=0)

@@ -7,23 +7,21 @@ change of its light for masks of 0 and 1 alone; what lies between is mixed at th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from icheat_usd.edits.bound import Ends, weighted
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.operations import PairEnd
-from icheat_usd.final_gather.caster_light import CasterLight, is_of_objects
+from icheat_usd.final_gather.caster_light import CasterKeys, CasterLight, caster_keys, is_of_masks
 from icheat_usd.final_gather.gatherer import Gatherer
+from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, RecordValues
+from icheat_usd.final_gather.receiver_sets import Mixtures, Touched, mixtures
 from icheat_usd.final_gather.record_rays import RecordRays, take_rays
+from icheat_usd.kernels import record_mixtures as kernels
 from icheat_usd.materials import take_points
-from icheat_usd.scene import F32, I32, I64, U8, Bool, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
 
-#: Masks of one receiver between 0 and 1; with more, mixtures would be of more than 16 sets.
-MOST_SOFT = 4
-_RAYS_AT_ONCE = 1 << 18
 _STEP = 0.1  # of a record's reach, or radians: from how far beside a record a receiver's own part is looked at
 
 
@@ -32,93 +30,145 @@ class EditedRecords:
 
     Parameters
     ----------
-    cache : IrradianceCache
-        Its rays are kept.
-    by_caster : CasterLight, optional
-        Of another stack that tells the same groups of lights apart.
+    hemispheres : Hemispheres
+        Rays of the cache's records.
     """
 
-    def __init__(self, gatherer: Gatherer, cache: IrradianceCache, by_caster: CasterLight | None = None) -> None:
-        self._gatherer, self._cache = gatherer, cache
-        self.by_caster: CasterLight | None = None
-        if is_of_objects(gatherer.field):
-            assert gatherer.solution is not None
-            self.by_caster = by_caster or CasterLight(cache, gatherer.solution)
-        self._slots: dict[bytes, np.ndarray] = {}
-        self._values = RecordValues(
-            np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty((0, 3, 3), np.float32)
-        )
+    def __init__(self, gatherer: Gatherer, cache: IrradianceCache, hemispheres: Hemispheres) -> None:
+        assert gatherer.solution is not None
+        self._gatherer, self._cache, self._hemispheres = gatherer, cache, hemispheres
+        self._sums = CasterLight(gatherer.snapshot.geometry, gatherer.solution)
+        self._is_summed = is_of_masks(gatherer.field)
+        self._keys: dict[bytes, CasterKeys | None] = {}
+        self._every: CasterKeys | None = None
+        if self._is_summed:
+            self._every = caster_keys(gatherer.field, np.ones(gatherer.field.n_rows, np.bool_))
+        self._slots: dict[bytes, I32] = {}
+        self._values = _no_values(0)
 
-    def change(self, found: Lookup, position: F32, normal: F32, masks: F32) -> F32:
-        """Change of irradiance at m places with records.
+    def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
+        """Change of irradiance at m receivers with records.
 
         Parameters
         ----------
-        masks : (n_rows, m) float32
-            Receiver masks; no more than `MOST_SOFT` of a place lie between 0 and 1.
+        found : of all points
+        receivers : Touched
+            No more than `MOST_SOFT` masks of each lie between 0 and 1.
 
         Returns
         -------
         (m, 3) float32
         """
-        result = np.zeros((len(position), 3), np.float32)
-        mixtures = list(_mixtures(masks))
-        wanted: dict[bytes, tuple[Bool, Bool]] = {}
-        for is_in, places, _ in mixtures:
-            needed = wanted.setdefault(is_in.tobytes(), (is_in, np.zeros(self._cache.n, bool)))[1]
-            number = found.number[places]
-            entries = np.arange(found.record.shape[1]) < number[:, None]
-            needed[found.record[places][entries]] = True
-        self._prepare(list(wanted.values()))
-        for is_in, places, weight in mixtures:
-            part = self._cache.interpolate(
-                found.take(places), position[places], normal[places], self._values, self._slots[is_in.tobytes()]
-            )
-            result[places] += weight[:, None] * part
-        return result
+        cache, where, which = self._cache, receivers.where, receivers.which
+        mixed = _mixtures_of(receivers)
+        needed = np.zeros((len(mixed.is_in), cache.n), np.uint8)
+        kernels.mark_records(found.number, found.record, where, which, mixed.begin, mixed.entry, needed)
+        self._prepare(mixed, needed.view(np.bool_))
+        slots = [self._slots[is_in.tobytes()] for is_in in mixed.is_in]
+        out = np.empty((len(where), 3), np.float32)
+        kernels.mix_records(
+            cache.table.position,
+            cache.table.normal,
+            *self._values,
+            np.stack(slots) if slots else np.zeros((0, cache.n), np.int32),
+            points.position,
+            points.shading_normal,
+            *found[:3],
+            where,
+            which,
+            *mixed[2:],
+            out,
+        )
+        return out
 
-    def _prepare(self, wanted: list[tuple[Bool, Bool]]) -> None:
-        """Changes of records in some sets of edits; `wanted` are masks (n_rows,) and records (n_records,)."""
-        missing = []
-        for is_in, needed in wanted:
-            slots = self._slots.setdefault(is_in.tobytes(), np.full(self._cache.n, -1, np.int32))
-            missing.append((is_in, slots, needed & (slots < 0)))
-        every = np.zeros(self._cache.n, bool)
-        for _, _, needed in missing:
-            every |= needed
-        if not every.any():
-            return
-        cache = self._cache
+    def change_alone(self, points: SurfacePoints, rays: Hemispheres, row: I64, receivers: Touched) -> F32:
+        """The same at m receivers without records, from hemispheres of their own; `row` (m,) is that of each."""
+        mixed = _mixtures_of(receivers)
+        keys = [self._keys_of(active) for active in mixed.active]
+        if not self._is_summed or any(one is None for one in keys):
+            own = rays.parts[0].rays
+            pairs = RecordPairs(self._gatherer, take_rays(own, row), take_points(points, receivers.where))
+            return np.asarray(np.pi * pairs.change(np.arange(len(row)), receivers.ends().masks).mean(axis=1))
+        out = np.zeros((len(row), 3), np.float32)
+        number = np.diff(mixed.begin)[receivers.which]
+        owner = np.repeat(np.arange(len(row)), number)
+        nth = np.arange(len(owner)) - (np.cumsum(number) - number)[owner]
+        entry = mixed.begin[receivers.which][owner] + nth
+        for one, (is_in, key) in enumerate(zip(mixed.is_in, keys, strict=True)):
+            mine = np.flatnonzero(mixed.entry[entry] == one)
+            needed = np.zeros(rays.n, np.bool_)
+            needed[row[owner[mine]]] = True
+            assert key is not None
+            light = self._sums.change(rays, self._gatherer.field, key, is_in, needed)
+            place = (np.cumsum(needed) - 1)[row[owner[mine]]]
+            out[owner[mine]] += mixed.weight[entry[mine]][:, None] * light.irradiance[place]
+        return out
+
+    def _keys_of(self, active: Bool) -> CasterKeys | None:
+        """What tells the light apart for receivers in some edits; None if no sums do."""
+        if self._every is not None or not self._is_summed:
+            return self._every
+        name = active.tobytes()
+        if name not in self._keys:
+            self._keys[name] = caster_keys(self._gatherer.field, active)
+        return self._keys[name]
+
+    def _prepare(self, mixed: Mixtures, wanted: Bool) -> None:
+        """Changes of records in some sets of edits; `wanted` is (n_sets, n_records)."""
         n = len(self._values.irradiance)
-        total = 0
-        for _, slots, needed in missing:
+        parts, missing = [self._values], []
+        for is_in, active, asked in zip(mixed.is_in, mixed.active, wanted, strict=True):
+            slots = self._slots.setdefault(is_in.tobytes(), np.full(self._cache.n, -1, np.int32))
+            needed = asked & (slots < 0)
             count = int(needed.sum())
-            slots[needed] = n + total + np.arange(count, dtype=np.int32)
-            total += count
-        if self.by_caster is not None:
-            field = self._gatherer.field
-            parts = [self.by_caster.change(field, is_in, needed) for is_in, _, needed in missing]
-            self._values = RecordValues(*(np.concatenate(c) for c in zip(self._values, *parts, strict=True)))
-            return
-        shape = (total, 3)
-        fresh = RecordValues(np.zeros(shape, np.float32), *(np.zeros((*shape, 3), np.float32) for _ in range(2)))
-        share = (1 / np.bincount(cache.owner, minlength=cache.n)).astype(np.float32)
-        hemispheres = np.flatnonzero(every[cache.owner])
-        at_once = max(1, _RAYS_AT_ONCE // cache.rays.n_rays)
-        for begin in range(0, len(hemispheres), at_once):
-            chunk = hemispheres[begin : begin + at_once]
-            owner = cache.owner[chunk]
-            pairs = RecordPairs(self._gatherer, take_rays(cache.rays, chunk), take_points(cache.points, chunk))
-            for is_in, slots, needed in missing:
+            if count == 0:
+                continue
+            slots[needed] = n + np.arange(count, dtype=np.int32)
+            n += count
+            keys = self._keys_of(active)
+            if keys is not None:
+                parts.append(self._sums.change(self._hemispheres, self._gatherer.field, keys, is_in, needed))
+                continue
+            parts.append(_no_values(count))
+            missing.append((is_in, needed, parts[-1]))
+        if missing:
+            self._by_pairs(missing)
+        if len(parts) > 1:
+            self._values = RecordValues(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def _by_pairs(self, missing: list[tuple[Bool, Bool, RecordValues]]) -> None:
+        """Changes of records ray by ray: sets of edits, the records (n_records,) wanted in each, and their values."""
+        cache, hemispheres = self._cache, self._hemispheres
+        every = np.zeros(cache.n, np.bool_)
+        for _, needed, _ in missing:
+            every |= needed
+        share = hemispheres.shares()
+        for rays, points, owner in hemispheres.chunks():
+            some = np.flatnonzero(every[owner])
+            if len(some) == 0:
+                continue
+            owner = owner[some]
+            pairs = RecordPairs(self._gatherer, take_rays(rays, some), take_points(points, some))
+            for is_in, needed, values in missing:
                 rows = np.flatnonzero(needed[owner])
-                if len(rows):
-                    found = pairs.values(rows, owner[rows], is_in, cache)
-                    weight = share[owner[rows]]
-                    for column, part in zip(fresh, found, strict=True):
-                        part *= weight.reshape(-1, *(1,) * (part.ndim - 1))
-                        # One hemisphere after another, whichever chunk it is in.
-                        np.add.at(column, slots[owner[rows]] - n, part)
-        self._values = RecordValues(*(np.concatenate(pair) for pair in zip(self._values, fresh, strict=True)))
+                if len(rows) == 0:
+                    continue
+                found = pairs.values(rows, owner[rows], is_in, cache)
+                place = (np.cumsum(needed) - 1)[owner[rows]]
+                for column, part in zip(values, found, strict=True):
+                    part *= share[owner[rows]].reshape(-1, *(1,) * (part.ndim - 1))
+                    # One hemisphere after another, whichever chunk it is in.
+                    np.add.at(column, place, part)
+
+
+def _no_values(n: int) -> RecordValues:
+    return RecordValues(np.zeros((n, 3), np.float32), *(np.zeros((n, 3, 3), np.float32) for _ in range(2)))
+
+
+def _mixtures_of(receivers: Touched) -> Mixtures:
+    used = np.zeros(receivers.columns.shape[1], np.bool_)
+    used[receivers.which] = True
+    return mixtures(receivers.columns, used)
 
 
 class RecordPairs:
@@ -230,47 +280,3 @@ def _is_located(receivers: Ends, field: EditField) -> F32:
                 entry += 1
             row += 1
     return located
-
-
-def soft_masks(masks: F32) -> I64:
-    """(m,) how many masks (n_rows, m) of each receiver lie between 0 and 1."""
-    found: I64 = ((masks > 0) & (masks < 1)).sum(axis=0)
-    return found
-
-
-def _mixtures(masks: F32) -> Iterator[tuple[Bool, I64, F32]]:
-    """Sets of edits (n_rows,) with the receivers (k,) that are in them to a degree (k,), which is given too."""
-    hard, soft = masks >= 1, (masks > 0) & (masks < 1)
-    first, which = _patterns(np.packbits(np.concatenate([hard, soft]), axis=0))
-    order = np.argsort(which, kind="stable")
-    begin = np.searchsorted(which[order], np.arange(len(first) + 1))
-    for pattern, example in enumerate(first.tolist()):
-        places = order[begin[pattern] : begin[pattern + 1]]
-        rows = np.flatnonzero(soft[:, example])
-        for bits in range(1 << len(rows)):
-            is_in = hard[:, example].copy()
-            weight = np.ones(len(places), np.float32)
-            for k, row in enumerate(rows.tolist()):
-                inside = bool(bits >> k & 1)
-                is_in[row] = inside
-                weight *= masks[row, places] if inside else 1 - masks[row, places]
-            if is_in.any():
-                yield is_in, places, weight
-
-
-def _patterns(columns: U8) -> tuple[I64, I64]:
-    """Different columns of (k, m) bytes: the first place of each, and which one every place has.
-
-    ``np.unique(columns, axis=1)``, which sorts whole columns, took a quarter of a frame with 64 edits.
-    """
-    k, m = columns.shape
-    words = np.zeros((m, -(-k // 8) * 8), np.uint8)
-    words[:, :k] = columns.T
-    key = np.zeros(m, np.uint64)
-    for word in words.view(np.uint64).T:
-        key = (key ^ word) * np.uint64(0x9E3779B97F4A7C15)
-        key ^= key >> np.uint64(29)
-    _, first, which = np.unique(key, return_index=True, return_inverse=True)
-    if not (columns == columns[:, first[which]]).all():  # Two patterns share a key.
-        _, first, which = np.unique(columns, axis=1, return_index=True, return_inverse=True)
-    return first, which.reshape(-1)

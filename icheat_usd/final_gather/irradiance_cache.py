@@ -163,6 +163,11 @@ class IrradianceCache:
         return self._rays[0]
 
     @property
+    def parts(self) -> list[tuple[RecordRays, SurfacePoints, I64]]:
+        """Hemispheres as they were traced, where they stand, and the record that each belongs to; none if not kept."""
+        return list(zip(self._rays, self._points, self._owner, strict=True))
+
+    @property
     def owner(self) -> I64:
         """(n_hemispheres,) the record that each of `rays` belongs to."""
         if len(self._owner) > 1:

@@ -10,7 +10,6 @@ import numpy as np
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.final_gather.cached import CachedGather, under_stack
-from icheat_usd.final_gather.caster_light import CasterLight
 from icheat_usd.final_gather.edited_records import EditedRecords
 from icheat_usd.final_gather.gatherer import Gatherer, GatherSolution
 from icheat_usd.samples import ViewSamples
@@ -43,7 +42,6 @@ class Replay:
 
     def __init__(self, gatherer: Gatherer, cached: CachedGather, bands: list[KeptBand], per_light: F32) -> None:
         self._gatherer, self._cached, self._bands, self._per_light = gatherer, cached, bands, per_light
-        self._by_caster: CasterLight | None = None
 
     def edited(self, field: EditField) -> F64:
         """Indirect light under a stack, (height, width, 3).
@@ -55,13 +53,10 @@ class Replay:
         """
         gatherer = self._under(field)
         cache = self._cached.cache
-        # Light of all lamps together is the same for all stacks; which lamps another one tells apart is not known.
-        is_one = field.n_groups == 1
-        records = EditedRecords(gatherer, cache, self._by_caster if is_one else None)
-        self._by_caster = (records.by_caster if is_one else None) or self._by_caster
+        records = None if field.is_identity else EditedRecords(gatherer, cache, self._cached.hemispheres)
         parts = []
         for (pixels, view), sampled in zip(self._bands, self._cached.samples, strict=True):
-            light = sampled.base if field.is_identity else under_stack(gatherer, records, sampled)
+            light = sampled.base if records is None else under_stack(gatherer, records, sampled)
             parts.append(develop(view, light, pixels))
         camera = gatherer.snapshot.camera
         return np.concatenate(parts).reshape(camera.height, camera.width, 3)

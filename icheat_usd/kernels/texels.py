@@ -68,6 +68,18 @@ def _bilinear(texels, uv):  # type: ignore[no-untyped-def]
     return top * (one - y) + bottom * y
 
 
+@kernel
+def texel_weight(texels, first, resolution, s, t):  # type: ignore[no-untyped-def]
+    """Bilinear weight at one place of a face whose texels are ``texels[first:first + resolution**2]``."""
+    x0, y0 = _low_texel(s, resolution), _low_texel(t, resolution)
+    x1, y1 = min(x0 + 1, resolution - 1), min(y0 + 1, resolution - 1)
+    x, y = _texel_place(s, resolution) - np.float32(x0), _texel_place(t, resolution) - np.float32(y0)
+    one = np.float32(1)
+    top = texels[first + y0 * resolution + x0] * (one - x) + texels[first + y0 * resolution + x1] * x
+    bottom = texels[first + y1 * resolution + x0] * (one - x) + texels[first + y1 * resolution + x1] * x
+    return top * (one - y) + bottom * y
+
+
 @parallel_kernel
 def bilinear_texels(texels, rows, uv, out):  # type: ignore[no-untyped-def]
     """Weights (n,) at places `uv` (n, 2) of the faces in some rows of `texels` (n_faces, resolution, resolution)."""

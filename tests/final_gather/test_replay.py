@@ -6,12 +6,25 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.edits.model import Edit
+from icheat_usd.edits.model import Edit, KeyedPayload, Payload
 from icheat_usd.final_gather import GatherSettings, final_gather
-from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, WHITE, painted, previews
+from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, WHITE, painted, previews, soft
 from tests.pipeline import TINY, select
 
 SETTINGS = GatherSettings(4, 16, 4, 4, edge_samples=2, cache=TINY)
+
+
+def brushed(name: str, operation: str, color: tuple[float, float, float], seed: int) -> Edit:
+    """From painted places on a side wall to everything."""
+    payload = Payload(operation, {"color": color}, caster_mask=soft("/red", seed))
+    return Edit(name, operation, {}, EVERYTHING, select("/red"), keys=(KeyedPayload(payload, 1.0),))
+
+
+BRUSHED = (
+    brushed("/a", "scale", (3.0, 0.5, 2.0), 3),
+    brushed("/b", "emit", (0.2, 0.3, 0.1), 4),
+    brushed("/c", "scale", (0.1, 2.0, 4.0), 5),
+)
 STACKS = {
     "nothing": (),
     "objects": (BLEED,),
@@ -20,6 +33,8 @@ STACKS = {
     "added light": (Edit("/emit", "emit", {"color": (0.2, 0.1, 0.3)}, select("/floor"), select("/tall")), BLEED),
     "hue": (GREY,),
     "soft masks": (painted("scale", {"gain": 4.0}), DIM),
+    "painted casters": BRUSHED,
+    "painted casters and objects": (BRUSHED[0], painted("scale", {"gain": 4.0}), BLEED, *BRUSHED[1:]),
     "direction": (Edit("/e", "falloff", {"exponent": 1.0}, WHITE, EVERYTHING),),
     "curve": (Edit("/g", "gamma", {"exponent": 0.7}, select("/floor"), EVERYTHING),),
 }
@@ -55,11 +70,13 @@ def test_a_render_that_is_not_kept_has_no_replay():
     assert rendered(BLEED).replay is None
 
 
-@pytest.mark.parametrize("name", ["objects", "overlapping", "added light"])
+@pytest.mark.parametrize(
+    "name", ["objects", "overlapping", "added light", "soft masks", "painted casters", "painted casters and objects"]
+)
 def test_light_by_caster_is_the_light_of_the_rays(name, monkeypatch):
     """Summed for each caster first, and edited ray by ray."""
     fast = rendered(*STACKS[name]).indirect_edited
-    monkeypatch.setattr("icheat_usd.final_gather.edited_records.is_of_objects", lambda field: False)
+    monkeypatch.setattr("icheat_usd.final_gather.edited_records.is_of_masks", lambda field: False)
     slow = rendered(*STACKS[name]).indirect_edited
     assert (fast != slow).any()
     np.testing.assert_allclose(fast, slow, rtol=2e-4, atol=1e-6)

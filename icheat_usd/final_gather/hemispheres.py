@@ -1,0 +1,74 @@
+"""Hemispheres of rays of many records, in the parts that they were traced in, and what was found of their light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from icheat_usd.final_gather.record_rays import RecordRays
+from icheat_usd.materials import take_points
+from icheat_usd.scene import F32, I64, SurfacePoints
+
+if TYPE_CHECKING:
+    from icheat_usd.final_gather.caster_light import LightByKey
+
+_RAYS_AT_ONCE = 1 << 19
+
+
+class Part(NamedTuple):
+    """Some hemispheres."""
+
+    rays: RecordRays
+    points: SurfacePoints  #: where they stand
+    owner: I64  #: record of each
+
+
+@dataclass(eq=False)
+class Hemispheres:
+    """Rays of n records; some have several hemispheres."""
+
+    parts: list[Part]
+    shrink: F32  #: (n,) factor on what changes with place
+    light: list[LightByKey] = field(default_factory=list)
+    _shares: F32 | None = None
+
+    @property
+    def n(self) -> int:
+        return len(self.shrink)
+
+    def shares(self) -> F32:
+        """(n,) share of each of a record's hemispheres in its light."""
+        if self._shares is None:
+            number = np.zeros(self.n, np.int64)
+            for part in self.parts:
+                number += np.bincount(part.owner, minlength=self.n)
+            self._shares = (1 / np.maximum(number, 1)).astype(np.float32)
+        return self._shares
+
+    def chunks(self) -> Iterator[Part]:
+        """All of them, not too many at once; parts that are small enough as they are."""
+        for part in self.parts:
+            n, at_once = len(part.owner), max(1, _RAYS_AT_ONCE // part.rays.n_rays)
+            if n <= at_once:
+                yield part
+                continue
+            for first in range(0, n, at_once):
+                some = slice(first, min(first + at_once, n))
+                yield Part(_rows(part.rays, some), take_points(part.points, some), part.owner[some])
+
+
+def _rows(rays: RecordRays, some: slice) -> RecordRays:
+    begin, end = np.searchsorted(rays.detour, rays.n_rays * np.array([some.start, some.stop])).tolist()
+    columns = {
+        name: getattr(rays, name)[some]
+        for name in ("stream", "position", "shading_normal", "cell", "distance", "instance", "triangle", "uv")
+    }
+    return rays._replace(
+        detour=rays.detour[begin:end] - some.start * rays.n_rays,
+        throughput=rays.throughput[begin:end],
+        detour_ends=take_points(rays.detour_ends, slice(begin, end)),
+        **columns,
+    )
