@@ -165,6 +165,8 @@ class IrradianceCache:
     @property
     def parts(self) -> list[tuple[RecordRays, SurfacePoints, I64]]:
         """Hemispheres as they were traced, where they stand, and the record that each belongs to; none if not kept."""
+        if len({len(self._rays), len(self._points), len(self._owner)}) > 1:  # Someone wanted them joined.
+            return [(self.rays, self.points, self.owner)]
         return list(zip(self._rays, self._points, self._owner, strict=True))
 
     @property
