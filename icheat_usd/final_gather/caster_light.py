@@ -131,6 +131,8 @@ class CasterLight:
         )
         adds = not self._is_part and _adds_light(field)
         light = self._light(of, keys, adds)
+        if len(light.keys.instance) == 0:  # Edits of nothing but views.
+            return out
         factor, added = _coefficients(field, light.keys, is_in)
         weight = np.zeros((len(factor), light.values.irradiance.shape[1]), np.float32)
         weight[:, : 3 * n_groups] = factor.reshape(len(factor), -1)
@@ -288,7 +290,7 @@ def _coefficients(field: EditField, keys: CasterKeys, is_in: Bool) -> tuple[F32,
     inverse = inverse.reshape(-1)
     factor = (found.scale - np.float32(1)).transpose(1, 0, 2)[inverse]
     added = found.emission[inverse]
-    first = subset[np.minimum(table.first, len(subset) - 1)][instance] if len(subset) else subset
+    first = subset[table.first[instance]]
     for bit in range(kernels.MOST_MASKS):
         held = np.flatnonzero(subset >> bit & 1 == 1)
         # What has no key of its own is what no edit acts on: 0.
