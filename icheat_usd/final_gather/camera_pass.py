@@ -20,12 +20,15 @@ from icheat_usd.tracing import Tracer
 #: Camera samples that are kept from the first pass for the second, of all bands; 200 bytes each.
 _KEPT = 2_000_000
 
+_NO_EDGES: I64 = np.empty(0, np.int64)
+
 
 class Band(NamedTuple):
     """A part of the image."""
 
-    pixels: tuple[int, int]  #: the first and the one behind the last, row-major
+    pixels: tuple[int, int]  #: the first and the one behind the last, row-major: whole rows
     view: ViewSamples
+    edges: I64  #: (m,) ascending: pixels with more samples than the others
 
 
 class CameraPass:
@@ -51,10 +54,10 @@ class CameraPass:
         self._filter = PixelFilter(settings.pixel_filter, settings.filter_width)
         camera = snapshot.camera
         n_pixels = camera.width * camera.height
-        pixels = max(1, band // n)
+        pixels = max(1, band // n // camera.width) * camera.width
         self.bands = [(first, min(first + pixels, n_pixels)) for first in range(0, n_pixels, pixels)]
         self._kept: dict[int, ViewSamples] = {}
-        self._edges: I64 = np.empty(0, np.int64)
+        self._edges = _NO_EDGES
         self._is_kept = n_pixels * n <= _KEPT
 
     def first(self) -> Iterator[Band]:
@@ -66,7 +69,7 @@ class CameraPass:
                 self._kept[number] = view
             if self._n_edge:
                 looks.append(look_over(view, self._snapshot.camera, pixels))
-            yield Band(pixels, view)
+            yield Band(pixels, view, _NO_EDGES)
         if looks:
             self._edges = edge_pixels(join_looks(*looks), self._snapshot.camera.width)
 
@@ -80,7 +83,7 @@ class CameraPass:
             edges = self._edges[begin:end]
             if len(edges):
                 view = _joined(view, self._trace(edges, self._n_edge, self._first_edge), edges)
-            yield Band(pixels, view)
+            yield Band(pixels, view, edges)
 
     def _trace(self, pixels: tuple[int, int] | I64, n: int, first: int) -> ViewSamples:
         return view_samples(

@@ -24,6 +24,7 @@ from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
 from icheat_usd.final_gather.cached import CachedGather
 from icheat_usd.final_gather.camera_pass import CameraPass
+from icheat_usd.final_gather.direct_light import DirectLight
 from icheat_usd.final_gather.extras import (
     NO_EXTRAS,
     Extras,
@@ -41,7 +42,7 @@ from icheat_usd.final_gather.replay import KeptBand, Replay
 from icheat_usd.final_gather.settings import GatherSettings
 from icheat_usd.image.cryptomatte import Coverage, weighted_sum
 from icheat_usd.kernels.random import hash_combine
-from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
+from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
@@ -175,10 +176,11 @@ def final_gather(
         cached, records = _cached(gatherer, gather, camera, settings, seed, is_kept, progress)
         find = partial(_interpolated, gatherer, cached)
         replay = Replay(gatherer, cached, kept, gather_radiance) if is_kept else None
-    for number, (pixels, view) in enumerate(camera.all()):
+    direct = DirectLight(snapshot, tracer, sampler, settings)
+    for number, ((pixels, view, _), per_light) in enumerate(direct.bands(camera.all())):
         progress("gather", number / len(camera.bands))
         own_seed = int(hash_combine(seed, pixels[0]))
-        bands.append(_band(gatherer, find, view, settings, pixels, own_seed, extras))
+        bands.append(_band(gatherer, find, view, per_light, pixels, own_seed, extras))
         if replay is not None:
             kept.append(KeptBand(pixels, view))
     progress("gather", 1.0)
@@ -216,7 +218,7 @@ def _cached(
     keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.is_identity
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=keeps_rays)
     found, pixel = [], []
-    for _, view in camera.first():
+    for _, view, _ in camera.first():
         found.append(places_of(snapshot, gatherer.tracer, view, seed))
         pixel.append(view.pixel)
     placed = overture(cache, join_places(found), np.concatenate(pixel), snapshot.camera.width, progress)
@@ -263,20 +265,11 @@ def _band(
     gatherer: Gatherer,
     find: FindLight,
     view: ViewSamples,
-    settings: GatherSettings,
+    per_light: F32,
     pixels: tuple[int, int],
     seed: int,
     extras: Extras,
 ) -> _Band:
-    per_light = reflected_direct(
-        gatherer.snapshot,
-        gatherer.tracer,
-        gatherer.sampler,
-        view.points,
-        view.to_eye,
-        seed,
-        samples_per_light(gatherer.snapshot, settings.light_samples, settings.dome_samples),
-    )
     light = find(view, view.stream.astype(np.int64) & 0x7FFFFFFF, seed)
     usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),

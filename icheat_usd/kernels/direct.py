@@ -38,7 +38,7 @@ def fill_analytic(
     normal: F32,
     shading_normal: F32,
     instance: I32,
-    first: int,
+    draws: I64,
     n_samples: int,
     seed: int,
     cosine: bool,
@@ -50,7 +50,8 @@ def fill_analytic(
     """Shadow rays of every point to one light that is no mesh.
 
     Rows of the outputs are point-major, `n_samples` each. `radiance` holds L / (pdf n_samples),
-    times the shading cosine if `cosine`; zero below either horizon.
+    times the shading cosine if `cosine`; zero below either horizon. `draws` (n, 2) are each point's sequence of
+    random numbers and the number in it of the first one.
     """
     kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
     texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
@@ -59,7 +60,7 @@ def fill_analytic(
     for i in prange(position.shape[0]):
         if instance[i] < 0:
             continue
-        sequence = hash_combine(hash_combine(hash_combine(seed, 0x11), first + i), light)
+        sequence = hash_combine(hash_combine(hash_combine(seed, 0x11), draws[i, 0]), light)
         px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
         gx, gy, gz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
         nx, ny, nz = float(shading_normal[i, 0]), float(shading_normal[i, 1]), float(shading_normal[i, 2])
@@ -67,7 +68,7 @@ def fill_analytic(
         if kind == _DOME:
             guided = find_row(axis, split, child, rows, light, px, py, pz, nx, ny, nz)
         for k in range(n_samples):
-            u1, u2 = sobol_pair(k, sequence)
+            u1, u2 = sobol_pair(draws[i, 1] + k, sequence)
             v1, v2 = float(u1), float(u2)
             factor = 1.0
             if guided >= 0 and image[0] >= 0:
@@ -126,7 +127,7 @@ def fill_mesh(
     normal: F32,
     shading_normal: F32,
     instance: I32,
-    first: int,
+    draws: I64,
     n_samples: int,
     seed: int,
     cosine: bool,
@@ -147,10 +148,10 @@ def fill_mesh(
     for i in prange(position.shape[0]):
         if instance[i] < 0:
             continue
-        sequence = hash_combine(hash_combine(hash_combine(seed, 0x11), first + i), light)
+        sequence = hash_combine(hash_combine(hash_combine(seed, 0x11), draws[i, 0]), light)
         px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
         for k in range(n_samples):
-            u1, u2 = sobol_pair(k, sequence)
+            u1, u2 = sobol_pair(draws[i, 1] + k, sequence)
             e, b1, b2, lx, ly, lz, p = sample_mesh(cdf, corners, begin, end, px, py, pz, float(u1), float(u2))
             if p <= 0.0:
                 continue
@@ -193,12 +194,12 @@ def sum_rays(values: F32, begin: I64, out: F32) -> None:
 
 
 @parallel_kernel
-def fill_specular_numbers(point: I64, n_samples: int, seed: int, out: F32) -> None:
-    """Random pairs (n n_samples, 2) for the specular rays of each point, numbered by `point`."""
-    for i in prange(point.shape[0]):
-        sequence = hash_combine(hash_combine(seed, 0x12), point[i])
+def fill_specular_numbers(draws: I64, n_samples: int, seed: int, out: F32) -> None:
+    """Random pairs (n n_samples, 2) for the specular rays of each point; `draws` as in `fill_analytic`."""
+    for i in prange(draws.shape[0]):
+        sequence = hash_combine(hash_combine(seed, 0x12), draws[i, 0])
         for k in range(n_samples):
-            u1, u2 = sobol_pair(k, sequence)
+            u1, u2 = sobol_pair(draws[i, 1] + k, sequence)
             out[i * n_samples + k, 0] = u1
             out[i * n_samples + k, 1] = u2
 

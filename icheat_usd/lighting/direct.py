@@ -4,44 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from icheat_usd.kernels.direct import (
-    fill_analytic,
-    fill_mesh,
-    fill_specular_numbers,
-    meet_analytic,
-    mesh_pdfs,
-    sum_rays,
-)
-from icheat_usd.lighting.controls import hidden_instances, lit_instances, receives, shape, tracer_for, without
+from icheat_usd.kernels.direct import fill_analytic, fill_mesh
+from icheat_usd.lighting.controls import lit_instances, shape, tracer_for
 from icheat_usd.lighting.sampler import LightSampler
-from icheat_usd.materials import (
-    evaluate,
-    evaluate_specular,
-    is_glossy,
-    points_on_surface,
-    sample_specular,
-    shade_hits,
-    take_points,
-)
+from icheat_usd.lighting.specular_rays import STOP_SHORT, add_rays, add_specular_rays, is_delta, power_heuristic
+from icheat_usd.materials import evaluate, evaluate_specular, is_glossy, points_on_surface, take_points
 from icheat_usd.materials.surface import nonzero_rows
-from icheat_usd.scene import F32, F64, Bool, DeltaKind, Hits, LightControls, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I64, LightControls, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, spawn_points, transmittance
-from icheat_usd.tracing.paths import passing_materials
 
 # Rays in flight: enough to keep every thread busy, few enough for some tens of megabytes.
 _RAYS = 1 << 18
-
-# A shadow ray stops short of an analytic light by this share of its length: such lights are often
-# authored in the plane of a ceiling, and they are not geometry that could stop it.
-_STOP_SHORT = np.float32(1.0 - 1e-4)
-
-# Surfaces that a specular ray goes through in search of mesh lights behind them.
-_LAYERS = 32
 
 
 def irradiance(
@@ -79,7 +56,8 @@ def irradiance(
     ----------
     .. [1] Urena, Fajardo, King 2013, An area-preserving parametrization for spherical rectangles.
     """
-    return _direct(snapshot, tracer, sampler, points, seed, n_samples, None)
+    counts = _counts(n_samples, len(snapshot.lights.kind))
+    return _direct(snapshot, tracer, sampler, points, seed, counts, None, 1)
 
 
 def reflected_direct(
@@ -114,10 +92,19 @@ def reflected_direct(
     .. [1] Veach 1997, Robust Monte Carlo Methods for Light Transport Simulation, section 9.2.
     """
     eye = np.require(to_eye, np.float32, ("C", "W"))
-    out = _direct(snapshot, tracer, sampler, points, seed, n_samples, eye)
     counts = _counts(n_samples, len(snapshot.lights.kind))
-    _add_specular_rays(snapshot, tracer, sampler, points, eye, seed, counts, out)
+    n_specular = specular_count(counts)
+    out = _direct(snapshot, tracer, sampler, points, seed, counts, eye, n_specular)
+    draws = own_draws(0, len(points.instance))
+    add_specular_rays(snapshot, tracer, sampler, points, eye, draws, seed, n_specular, counts, out)
     return out
+
+
+def own_draws(first: int, end: int) -> I64:
+    """Random numbers for points from number `first` to `end`, a sequence for each; (n, 2): sequence and place in it."""
+    draws = np.zeros((end - first, 2), np.int64)
+    draws[:, 0] = np.arange(first, end)
+    return draws
 
 
 def samples_per_light(snapshot: SceneSnapshot, light_samples: int, dome_samples: int | None) -> list[int]:
@@ -143,63 +130,91 @@ def _counts(n_samples: int | Sequence[int], n_lights: int) -> list[int]:
     return [max(int(count), 1) for count in counts]
 
 
+def specular_count(counts: Sequence[int]) -> int:
+    """Rays of the specular lobe per point, beside shadow rays of each light; they serve all lights."""
+    return max(1, max(counts, default=1) // 2)
+
+
 def _direct(
     snapshot: SceneSnapshot,
     tracer: Tracer,
     sampler: LightSampler,
     points: SurfacePoints,
     seed: int,
-    n_samples: int | Sequence[int],
+    counts: Sequence[int],
     to_eye: F32 | None,
+    n_specular: int,
 ) -> F32:
     lights = snapshot.lights
-    n = len(points.position)
-    counts = _counts(n_samples, len(lights.kind))
-    n_specular = _n_specular(counts)
+    n = len(points.instance)
     out = np.zeros((len(lights.kind), n, 3), np.float32)
+    draws = own_draws(0, n)
     for light in np.flatnonzero(nonzero_rows(lights.radiance)).tolist():
-        controls, to_light = snapshot.controls(light), tracer_for(snapshot, tracer, light)
-        delta = _is_delta(snapshot, light)
-        count = 1 if delta else counts[light]
-        step = max(1, _RAYS // count)
-        for first in range(0, n, step):
-            part = slice(first, min(first + step, n))
-            chunk = _part(points, part)
-            rays = _shadow_rays(snapshot, sampler, chunk, light, first, count, seed, to_eye is None)
-            if not len(rays.point):
-                continue
-            value = rays.radiance
-            if to_eye is not None:
-                shares = None if delta else (count, n_specular)
-                value = value * _response(chunk, to_eye[part], rays, shares, controls)
-                lit = np.flatnonzero(nonzero_rows(value))
-                rays, value = rays.take(lit), value[lit]
-            elif controls.diffuse != 1.0:
-                value = value * np.float32(controls.diffuse)
-            value = value * _visibility(snapshot, to_light, chunk, rays)
-            _add(value, rays.point, out[light, part])
+        count = 1 if is_delta(snapshot, light) else counts[light]
+        add_shadow_rays(
+            snapshot, tracer, sampler, points, to_eye, light, draws, seed, count, (count, n_specular), out[light]
+        )
     return out
 
 
-def _is_delta(snapshot: SceneSnapshot, light: int) -> bool:
-    """Whether a light shines from exactly one direction, which no ray finds by chance."""
-    return bool(snapshot.lights.kind[light] == LightKind.DISTANT and snapshot.lights.size[light, 0] <= 0.0)
+def add_shadow_rays(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    points: SurfacePoints,
+    to_eye: F32 | None,
+    light: int,
+    draws: I64,
+    seed: int,
+    count: int,
+    shares: tuple[int, int],
+    out: F32,
+    extremes: F32 | None = None,
+) -> None:
+    """Add what one light brings to each point along `count` shadow rays.
+
+    Parameters
+    ----------
+    to_eye : (n, 3) float32, optional
+        Radiance towards there is added; irradiance where it is None.
+    draws : (n, 2) int64
+        Which sequence of random numbers each point draws from, and the number in it of its first ray.
+    shares : (int, int)
+        How many shadow and specular rays a point has in all, by which the specular lobe is weighted.
+    out : (n, 3) float32
+    extremes : (n, 2) float32, optional
+        Lowered and raised to the least and the largest irradiance that a ray brings, of points that face the light.
+    """
+    controls, to_light = snapshot.controls(light), tracer_for(snapshot, tracer, light)
+    step = max(1, _RAYS // count)
+    n = len(points.instance)
+    for first in range(0, n, step):
+        part = slice(first, min(first + step, n))
+        chunk = _part(points, part)
+        rays = _shadow_rays(snapshot, sampler, chunk, light, draws[part], count, seed, to_eye is None)
+        if not len(rays.point):
+            continue
+        value = rays.radiance
+        if to_eye is not None:
+            known = None if is_delta(snapshot, light) else shares
+            value = value * _response(chunk, to_eye[part], rays, known, controls)
+            lit = np.flatnonzero(nonzero_rows(value))
+            rays, value = rays.take(lit), value[lit]
+        elif controls.diffuse != 1.0:
+            value = value * np.float32(controls.diffuse)
+        passed = _visibility(snapshot, to_light, chunk, rays)
+        if extremes is not None and len(rays.point):
+            _note_extremes(chunk, rays, passed, extremes[part])
+        add_rays(value * passed, rays.point, out[part])
 
 
-def _n_specular(counts: list[int]) -> int:
-    """Rays of the specular lobe per point, beside the shadow rays of each light; they serve all lights."""
-    return max(1, max(counts, default=1) // 2)
-
-
-def _power_heuristic(this: F64, other: F64) -> F32:
-    """Weight (m, 1) of a technique with expected density `this` (Veach 1997, eq. 9.13)."""
-    return np.asarray(this * this / (this * this + other * other), np.float32)[:, None]
-
-
-def _add(values: F32, point: NDArray[np.int64], out: F32) -> None:
-    """Sum rays (m, 3), in the order of their points, into (n, 3)."""
-    begin = np.searchsorted(point, np.arange(len(out) + 1))
-    sum_rays(np.ascontiguousarray(values, np.float32), begin, out)
+def _note_extremes(chunk: SurfacePoints, rays: _ShadowRays, passed: F32, extremes: F32) -> None:
+    cosine = np.einsum("ij,ij->i", chunk.shading_normal[rays.point], rays.direction)
+    brought = (rays.radiance * passed).max(axis=1) * cosine
+    begin = np.flatnonzero(np.diff(rays.point, prepend=-1))
+    point = rays.point[begin]
+    extremes[point, 0] = np.minimum(extremes[point, 0], np.minimum.reduceat(brought, begin))
+    extremes[point, 1] = np.maximum(extremes[point, 1], np.maximum.reduceat(brought, begin))
 
 
 def _response(
@@ -223,180 +238,9 @@ def _response(
         lobe *= np.float32(controls.specular)
     if shares is not None:
         of_rays = rays.pdf[glossy].astype(np.float64)
-        lobe *= _power_heuristic(shares[0] * of_rays, shares[1] * terms.pdf.astype(np.float64))
+        lobe *= power_heuristic(shares[0] * of_rays, shares[1] * terms.pdf.astype(np.float64))
     value[glossy] += lobe
     return value
-
-
-def _add_specular_rays(
-    snapshot: SceneSnapshot,
-    tracer: Tracer,
-    sampler: LightSampler,
-    points: SurfacePoints,
-    to_eye: F32,
-    seed: int,
-    counts: list[int],
-    out: F32,
-) -> None:
-    """Add what rays of the specular lobe find, weighted against the shadow rays of `_direct`."""
-    lights = snapshot.lights
-    glossy = np.flatnonzero(is_glossy(points))
-    shapes = [i for i, kind in enumerate(lights.kind) if kind != LightKind.MESH and not _is_delta(snapshot, i)]
-    meshes = _mesh_lights(snapshot)
-    if not len(glossy) or not (shapes or meshes):
-        return
-    count = _n_specular(counts)
-    step = max(1, _RAYS // count)
-    for first in range(0, len(glossy), step):
-        chosen = glossy[first : first + step]
-        rays = _specular_rays(snapshot, points, to_eye, chosen, seed, count)
-        if not len(rays.owner):
-            continue
-        unblocked: dict[Tracer, F32] = {}
-        for light in shapes:
-            m, to_light = len(rays.owner), tracer_for(snapshot, tracer, light)
-            distance, pdf, radiance = np.zeros(m, np.float32), np.zeros(m), np.zeros((m, 3), np.float32)
-            place = (rays.points.position, rays.points.shading_normal, rays.direction)
-            tables = lights, snapshot.textures, sampler.tables, sampler.guide
-            meet_analytic(*tables, light, *place, distance, pdf, radiance)
-            shape(snapshot, light, rays.direction, radiance)
-            shines = nonzero_rows(radiance)
-            lit = receives(snapshot, light, rays.points.instance)
-            if lit is not None:
-                shines &= lit
-            if lights.kind[light] == LightKind.DOME:
-                if to_light not in unblocked:
-                    unblocked[to_light] = transmittance(snapshot, to_light, rays.origin, rays.direction, np.inf)
-                met = np.flatnonzero(shines & nonzero_rows(unblocked[to_light]))
-                visible = unblocked[to_light][met]
-            else:
-                met = np.flatnonzero(shines)
-                visible = transmittance(
-                    snapshot, to_light, rays.origin[met], rays.direction[met], distance[met] * _STOP_SHORT
-                )
-            share = _power_heuristic(count * rays.pdf[met], counts[light] * pdf[met])
-            value = rays.weight[met] * radiance[met] * visible * share
-            if snapshot.controls(light).specular != 1.0:
-                value *= np.float32(snapshot.controls(light).specular)
-            sums = np.zeros((len(chosen), 3), np.float32)
-            _add(value, rays.owner[met], sums)
-            out[light, chosen] += sums
-        for hidden, some in meshes:
-            to_lights = without(snapshot, tracer, hidden)
-            for light, owner, value in _mesh_hits(snapshot, to_lights, sampler, some, rays, count, counts):
-                sums = np.zeros((len(chosen), 3), np.float32)
-                _add(value, owner, sums)
-                out[light, chosen] += sums
-
-
-def _mesh_lights(snapshot: SceneSnapshot) -> list[tuple[Bool | None, Bool]]:
-    """Glowing meshes, (n_lights,), by what does not block them, (n_instances,)."""
-    groups: dict[bytes, tuple[Bool | None, Bool]] = {}
-    for light in np.flatnonzero(snapshot.lights.kind == LightKind.MESH).tolist():
-        hidden = hidden_instances(snapshot, light)
-        key = b"" if hidden is None else hidden.tobytes()
-        group = groups.setdefault(key, (hidden, np.zeros(len(snapshot.lights.kind), np.bool_)))
-        group[1][light] = True
-    return list(groups.values())
-
-
-class _SpecularRays(NamedTuple):
-    owner: NDArray[np.int64]  #: (m,) ascending: row of the chosen points
-    points: SurfacePoints  #: (m,) where they start
-    origin: F32  #: (m, 3) off the surface
-    direction: F32  #: (m, 3) unit
-    pdf: F64  #: (m,) per solid angle
-    weight: F32  #: (m, 3) BRDF times cosine over pdf and number of rays
-
-
-def _specular_rays(
-    snapshot: SceneSnapshot, points: SurfacePoints, to_eye: F32, chosen: NDArray[np.int64], seed: int, count: int
-) -> _SpecularRays:
-    numbers = np.empty((len(chosen) * count, 2), np.float32)
-    fill_specular_numbers(chosen, count, seed & 0xFFFFFFFF, numbers)
-    owner = np.repeat(np.arange(len(chosen)), count)
-    starts, eye = take_points(points, chosen[owner]), to_eye[chosen[owner]]
-    direction, base, edge = sample_specular(starts, eye, numbers)
-    weight = (starts.specular * base[:, None] + starts.specular_edge * edge[:, None]) * np.float32(1.0 / count)
-    alive = np.flatnonzero(nonzero_rows(weight))
-    starts, direction = take_points(starts, alive), np.ascontiguousarray(direction[alive])
-    pdf = evaluate_specular(starts, eye[alive], direction).pdf.astype(np.float64)
-    return _SpecularRays(owner[alive], starts, spawn_points(snapshot, starts, direction), direction, pdf, weight[alive])
-
-
-def _mesh_hits(
-    snapshot: SceneSnapshot,
-    tracer: Tracer,
-    sampler: LightSampler,
-    some: Bool,
-    rays: _SpecularRays,
-    count: int,
-    counts: list[int],
-) -> list[tuple[int, NDArray[np.int64], F32]]:
-    """What specular rays bring from some mesh lights (n_lights,): light, owners (ascending) and values.
-
-    Light that shadow rays get straight through glass and holes must be found here too, so a ray goes on
-    behind what it hits as long as it might get through.
-    """
-    see_through = bool(passing_materials(snapshot.materials)[np.unique(snapshot.geometry.material)].any())
-    found: list[tuple[int, NDArray[np.int64], F32]] = []
-    ray = np.arange(len(rays.owner))
-    origin = rays.origin
-    for _ in range(_LAYERS if see_through else 1):
-        direction = np.ascontiguousarray(rays.direction[ray])
-        hits = tracer.intersect(origin, direction)
-        row = sampler.emissive_rows(hits.instance, hits.triangle)
-        lit = np.flatnonzero(row >= 0)
-        if not some.all():
-            lit = lit[some[sampler.emissive_light[row[lit]]]]
-        if len(lit):
-            found += _weigh_mesh_hits(snapshot, tracer, sampler, rays, ray[lit], row[lit], hits, lit, count, counts)
-        met = np.flatnonzero(hits.instance >= 0)
-        if not see_through or not len(met):
-            break
-        surface = shade_hits(snapshot, Hits._make(column[met] for column in hits), direction[met])
-        on = np.flatnonzero((surface.delta != DeltaKind.MIRROR) & (surface.opacity < 1.0))
-        ray, surface = ray[met[on]], take_points(surface, on)
-        if not len(ray):
-            break
-        origin = spawn_points(snapshot, surface, rays.direction[ray])
-    return found
-
-
-def _weigh_mesh_hits(
-    snapshot: SceneSnapshot,
-    tracer: Tracer,
-    sampler: LightSampler,
-    rays: _SpecularRays,
-    ray: NDArray[np.int64],
-    row: NDArray[np.int64],
-    hits: Hits,
-    lit: NDArray[np.int64],
-    count: int,
-    counts: list[int],
-) -> list[tuple[int, NDArray[np.int64], F32]]:
-    lights = snapshot.lights
-    starts, direction = take_points(rays.points, ray), np.ascontiguousarray(rays.direction[ray])
-    ends = shade_hits(snapshot, Hits._make(column[lit] for column in hits), direction)
-    light = sampler.emissive_light[row]
-    pdf = np.zeros(len(row))
-    mesh_pdfs(lights, sampler.tables, light, row, starts.position, ends.position, pdf)
-    share = _power_heuristic(count * rays.pdf[ray], np.array(counts)[light] * pdf)
-    value = rays.weight[ray] * ends.emission * lights.radiance[light] * share
-    stop = spawn_points(snapshot, ends, -direction)
-    start = rays.origin[ray]
-    value = value * transmittance(snapshot, tracer, start, stop - start, 1.0)
-    found = []
-    for one in np.unique(light).tolist():
-        mine = light == one
-        received = receives(snapshot, one, starts.instance)
-        if received is not None:
-            mine &= received
-        brought = value[mine]
-        if snapshot.controls(one).specular != 1.0:
-            brought *= np.float32(snapshot.controls(one).specular)
-        found.append((one, rays.owner[ray[mine]], brought))
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -430,7 +274,7 @@ def _shadow_rays(
     sampler: LightSampler,
     chunk: SurfacePoints,
     light: int,
-    first: int,
+    draws: I64,
     count: int,
     seed: int,
     cosine: bool,
@@ -441,7 +285,7 @@ def _shadow_rays(
     pdf = np.zeros(n, np.float32)
     radiance = np.zeros((n, 3), np.float32)
     surface = (chunk.position, chunk.normal, chunk.shading_normal, lit_instances(snapshot, light, chunk.instance))
-    place = (*surface, first, count, seed & 0xFFFFFFFF, cosine)
+    place = (*surface, draws, count, seed & 0xFFFFFFFF, cosine)
     if snapshot.lights.kind[light] != LightKind.MESH:
         fill_analytic(
             snapshot.lights,
@@ -477,7 +321,7 @@ def _visibility(snapshot: SceneSnapshot, tracer: Tracer, chunk: SurfacePoints, r
     # every ray leaves above the geometric normal, so one origin per point serves
     start = spawn_points(snapshot, chunk, chunk.normal)[rays.point]
     if rays.end is None:
-        return transmittance(snapshot, tracer, start, rays.direction, rays.distance * _STOP_SHORT)
+        return transmittance(snapshot, tracer, start, rays.direction, rays.distance * STOP_SHORT)
     # both ends stand on geometry: offset the far one as well, or a mesh light shadows itself
     stop = spawn_points(snapshot, rays.end, -rays.direction)
     return transmittance(snapshot, tracer, start, stop - start, 1.0)

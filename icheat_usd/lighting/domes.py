@@ -9,6 +9,7 @@ import numpy as np
 from icheat_usd.kernels import domes as kernels
 from icheat_usd.kernels.direct import fill_analytic
 from icheat_usd.lighting.change import LightImages, append_texture, new_light, texture_image
+from icheat_usd.lighting.direct import own_draws
 from icheat_usd.lighting.guide import Effort
 from icheat_usd.lighting.quick import Shadows
 from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
@@ -131,11 +132,12 @@ def _visible(
 ) -> tuple[I64, F32, F32]:
     """Point, direction and irradiance per radiance of the rays that see the sky."""
     size = len(points.instance) * n
+    draws = own_draws(first, first + len(points.instance))
     direction, radiance = np.zeros((size, 3), np.float32), np.zeros((size, 3), np.float32)
     distance, pdf = np.zeros(size, np.float32), np.zeros(size, np.float32)
     fill_analytic(
         even.lights, even.textures, sampler.tables, sampler.guide, 0, points.position, points.normal,
-        points.shading_normal, points.instance, first, n, seed & 0xFFFFFFFF, True, direction, distance, pdf, radiance,
+        points.shading_normal, points.instance, draws, n, seed & 0xFFFFFFFF, True, direction, distance, pdf, radiance,
     )  # fmt: skip
     rows = np.flatnonzero(radiance[:, 0])
     start = np.take(spawn_points(even, points, points.normal), rows // n, axis=0)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels.direct import fill_analytic, meet_analytic
 from icheat_usd.lighting import LightSampler, build_light_sampler, irradiance, reflected_direct, samples_per_light
+from icheat_usd.lighting.direct import own_draws
 from icheat_usd.scene import LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, build_tracer
 from tests.lighting import naive
@@ -123,7 +124,7 @@ def test_specular_rays_know_how_probably_shadow_rays_go_their_way(kind: str) -> 
     pdf, radiance = np.zeros(n, np.float32), np.zeros((n, 3), np.float32)
     tables = snapshot.lights, snapshot.textures, sampler.tables, sampler.guide
     surface = (p.position, p.normal, p.shading_normal, p.instance)
-    fill_analytic(*tables, 0, *surface, 0, n, 1, True, direction, distance, pdf, radiance)
+    fill_analytic(*tables, 0, *surface, own_draws(0, 1), n, 1, True, direction, distance, pdf, radiance)
     drawn = np.flatnonzero(pdf > 0)
     assert len(drawn) > n / 4
     asked = met(snapshot, sampler, place, direction[drawn])

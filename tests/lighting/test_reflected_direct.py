@@ -232,6 +232,7 @@ def test_reflected_light_has_the_same_bits_for_any_number_of_threads_and_any_chu
     finally:
         numba.set_num_threads(before)
     monkeypatch.setattr("icheat_usd.lighting.direct._RAYS", 64)
+    monkeypatch.setattr("icheat_usd.lighting.specular_rays._RAYS", 64)
     pieces = reflected_at(snapshot, points, n_samples=8)
     np.testing.assert_array_equal(alone, together)
     np.testing.assert_array_equal(pieces, together)
