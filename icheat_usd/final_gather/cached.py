@@ -52,9 +52,9 @@ class CachedGather:
         stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
         self._stacks = [(stack, EditedRecords(stack, cache, self.hemispheres)) for stack in stacks]
 
-    def light(self, places: Places, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
+    def light(self, places: Places, to_eye: F32, stream: I64, draws: I64, seed: int) -> GatheredLight:
         """Radiance towards the eye; points that no edit touches have the same bits in both results."""
-        sample = self._sample(places, to_eye, stream, seed)
+        sample = self._sample(places, to_eye, stream, draws, seed)
         if self._is_kept:
             self.samples.append(sample)
         if not self._stacks:
@@ -62,7 +62,7 @@ class CachedGather:
         *steps, edited = (under_stack(stack, records, sample) for stack, records in self._stacks)
         return GatheredLight(sample.base, edited, tuple(steps), self._parts.light(sample, edited))
 
-    def _sample(self, places: Places, to_eye: F32, stream: I64, seed: int) -> Sampled:
+    def _sample(self, places: Places, to_eye: F32, stream: I64, draws: I64, seed: int) -> Sampled:
         points = places.points
         position, normal = points.position, points.shading_normal
         found = self.cache.find(places)
@@ -73,7 +73,7 @@ class CachedGather:
             own_rays = self.cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone])
             irradiance[alone] = np.pi * own_rays.radiance(self.cache.cells).mean(axis=1)
         base = (points.albedo * (irradiance * _INVERSE_PI)).astype(np.float32, copy=False)
-        shiny = specular_lobe(self._gatherer, points, to_eye, stream, self._glossy_rays, seed)
+        shiny = specular_lobe(self._gatherer, points, to_eye, draws, self._glossy_rays, seed)
         if shiny is not None:
             base[shiny.where] += shiny.mean()
         own = None

@@ -99,6 +99,21 @@ class CameraPass:
         )
 
 
+def draws_of(view: ViewSamples, settings: GatherSettings) -> I64:
+    """What each view sample draws its random numbers from, (n, 2): its pixel's sequence, and its number in the pixel.
+
+    Images that are parts of one count on.
+    """
+    begin = np.flatnonzero(np.diff(view.pixel, prepend=-1))
+    number = np.arange(view.n) - np.repeat(begin, np.diff(begin, append=view.n))
+    first, first_edge = settings.first_sample or 0, settings.first_edge_sample
+    if first_edge is not None:
+        number += np.where(number < settings.samples_per_pixel, first, first_edge - settings.samples_per_pixel)
+    else:
+        number += first
+    return np.stack([view.pixel.astype(np.int64), number], axis=1)
+
+
 def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> ViewSamples:
     """Samples of both; in `pixels`, which `more` has, each counts as much as any other."""
     n, m = view.samples_per_pixel, more.samples_per_pixel

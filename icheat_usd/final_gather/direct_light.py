@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.final_gather.camera_pass import Band
+from icheat_usd.final_gather.camera_pass import Band, draws_of
 from icheat_usd.final_gather.settings import GatherSettings
 from icheat_usd.lighting import LightSampler, samples_per_light
 from icheat_usd.lighting.direct import add_shadow_rays, specular_count
@@ -54,7 +54,7 @@ class _First(NamedTuple):
 
     band: Band
     parts: list[_Part]
-    number: I64  #: (n,) of each view sample in its pixel
+    draws: I64  #: (n, 2) of each view sample: `draws_of`
     light: F32  #: (n_lights, n, 3) for each view sample
     extremes: F32  #: (n_lights, rows of the image, width, 2) least and largest irradiance by a ray of each pixel
 
@@ -90,11 +90,11 @@ class DirectLight:
         light = np.zeros((n_lights, view.n, 3), np.float32)
         seen = np.empty((n_lights, view.n, 2), np.float32)
         seen[...] = np.inf, -np.inf
-        parts, number = self._parts(band), self._numbers(view)
+        parts, draws = self._parts(band), draws_of(view, self._settings)
         for part in parts:
             for one in self._lights:
                 extremes = seen[one, part.rows]
-                light[one, part.rows] = self._shadowed(view, part, part.rows, number, one, False, extremes)
+                light[one, part.rows] = self._shadowed(view, part, part.rows, draws, one, False, extremes)
                 seen[one, part.rows] = extremes
         first, end = band.pixels
         of_pixels = np.empty((n_lights, end - first, 2), np.float32)
@@ -105,7 +105,7 @@ class DirectLight:
             of_pixels[:, shown, 0] = np.minimum.reduceat(seen[:, :, 0], begin, axis=1)
             of_pixels[:, shown, 1] = np.maximum.reduceat(seen[:, :, 1], begin, axis=1)
         by_rows = of_pixels.reshape(n_lights, -1, self._snapshot.camera.width, 2)
-        return _First(band, parts, number, light, by_rows)
+        return _First(band, parts, draws, light, by_rows)
 
     def _whole(self, first: _First, above: F32 | None, below: F32 | None) -> F32:
         view, light = first.band.view, first.light
@@ -116,13 +116,11 @@ class DirectLight:
                 n, whole = part.first[one], part.whole[one]
                 if whole > n:
                     rows = part.rows[doubtful[one, place[part.rows]]]
-                    more = self._shadowed(view, part, rows, first.number, one, True)
+                    more = self._shadowed(view, part, rows, first.draws, one, True)
                     light[one, rows] = light[one, rows] * np.float32(n / whole) + more * np.float32(1 - n / whole)
             found = np.zeros((len(light), len(part.rows), 3), np.float32)
             points, eye = take_points(view.points, part.rows), np.take(view.to_eye, part.rows, axis=0)
-            draws = np.stack(
-                [view.pixel[part.rows].astype(np.int64), first.number[part.rows] * part.n_specular], axis=1
-            )
+            draws = first.draws[part.rows] * (1, part.n_specular)
             add_specular_rays(
                 self._snapshot, self._tracer, self._sampler, points, eye, draws, self._settings.seed,
                 part.n_specular, part.whole, found,
@@ -135,31 +133,21 @@ class DirectLight:
         view: ViewSamples,
         part: _Part,
         rows: I64,
-        number: I64,
+        draws: I64,
         light: int,
         is_second: bool,
         extremes: F32 | None = None,
     ) -> F32:
         """Radiance by the first or the second shadow rays of some samples of a part."""
         count = part.whole[light] - part.first[light] if is_second else part.first[light]
-        draws = np.stack([view.pixel[rows].astype(np.int64), number[rows] * count + _SECOND * is_second], axis=1)
+        own = draws[rows] * (1, count) + (0, _SECOND * is_second)
         found = np.zeros((len(rows), 3), np.float32)
         add_shadow_rays(
             self._snapshot, self._tracer, self._sampler, take_points(view.points, rows),
-            np.take(view.to_eye, rows, axis=0), light, draws, self._settings.seed, count,
+            np.take(view.to_eye, rows, axis=0), light, own, self._settings.seed, count,
             (part.whole[light], part.n_specular), found, extremes,
         )  # fmt: skip
         return found
-
-    def _numbers(self, view: ViewSamples) -> I64:
-        """Number of each view sample in the sequence of its pixel; images that are parts of one count on."""
-        s = self._settings
-        begin = np.flatnonzero(np.diff(view.pixel, prepend=-1))
-        number = np.arange(view.n) - np.repeat(begin, np.diff(begin, append=view.n))
-        first = s.first_sample or 0
-        if s.first_edge_sample is None:
-            return number + first
-        return number + np.where(number < s.samples_per_pixel, first, s.first_edge_sample - s.samples_per_pixel)
 
     def _parts(self, band: Band) -> list[_Part]:
         s = self._settings

@@ -85,13 +85,23 @@ class Lobe(NamedTuple):
         return self.tint * (total.astype(np.float32) / np.float32(self.n_rays))
 
 
-def gathered_light(gatherer: Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, seed: int) -> GatheredLight:
-    """Gather at each point; points that no edit touches have the same bits in both results."""
+def gathered_light(
+    gatherer: Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, seed: int, draws: I64 | None = None
+) -> GatheredLight:
+    """Gather at each point; points that no edit touches have the same bits in both results.
+
+    Parameters
+    ----------
+    draws : (n, 2), optional
+        Of specular rays, as of `trace_specular`; by default every point has the sequence of its `stream`.
+    """
     g = gatherer
     everywhere = np.arange(len(stream), dtype=np.int64)
     lobes = [diffuse_lobe(g, points, everywhere, stream, seed)]
     base = lobes[0].mean()
-    shiny = specular_lobe(g, points, to_eye, stream, g.n_rays, seed)
+    if draws is None:
+        draws = np.stack([stream, np.zeros_like(stream)], axis=1)
+    shiny = specular_lobe(g, points, to_eye, draws, g.n_rays, seed)
     if shiny is not None:
         lobes.append(shiny)
         base[shiny.where] += shiny.mean()
@@ -139,7 +149,7 @@ def diffuse_lobe(gatherer: Gatherer, points: SurfacePoints, where: I64, stream: 
 
 
 def specular_lobe(
-    gatherer: Gatherer, points: SurfacePoints, to_eye: F32, stream: I64, n_rays: int, seed: int
+    gatherer: Gatherer, points: SurfacePoints, to_eye: F32, draws: I64, n_rays: int, seed: int
 ) -> Lobe | None:
     """Rays of the specular lobe of those points that have one."""
     g = gatherer
@@ -148,7 +158,7 @@ def specular_lobe(
         return None
     own = int(hash_combine(seed, 7))
     shiny = take_points(points, glossy)
-    rays = trace_specular(g.snapshot, g.tracer, shiny, to_eye[glossy], stream[glossy], n_rays, own)
+    rays = trace_specular(g.snapshot, g.tracer, shiny, to_eye[glossy], draws[glossy], n_rays, own)
     return _lit(g, glossy, rays, np.ones((len(glossy), 3), np.float32), int(hash_combine(own, 2)))
 
 

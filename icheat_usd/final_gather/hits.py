@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.kernels.direct import fill_specular_numbers
 from icheat_usd.kernels.gather import uniforms
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.samples import cosine_rays
-from icheat_usd.kernels.transport import point_sets
 from icheat_usd.lighting import LightSampler, irradiance
 from icheat_usd.materials import effective_albedo, nonzero_rows, sample_specular, take_points
 from icheat_usd.scene import F32, I64, Bool, SceneSnapshot, SurfacePoints
@@ -61,14 +61,18 @@ def trace_specular(
     tracer: Tracer,
     points: SurfacePoints,
     to_eye: F32,
-    stream: I64,
+    draws: I64,
     n_rays: int,
     seed: int,
 ) -> GatherRays:
-    """`n_rays` rays from each point that follow its specular lobe; the lobe's weight is in their throughput."""
-    repeated = take_points(points, np.repeat(np.arange(len(stream)), n_rays))
-    u = np.empty((len(stream) * n_rays, 2), np.float32)
-    point_sets(seed, stream, n_rays, u)
+    """`n_rays` rays from each point that follow its specular lobe; the lobe's weight is in their throughput.
+
+    `draws` (n, 2) are the sequence of each point and its number among those that share it: their rays are stratified
+    together.
+    """
+    repeated = take_points(points, np.repeat(np.arange(len(draws)), n_rays))
+    u = np.empty((len(draws) * n_rays, 2), np.float32)
+    fill_specular_numbers(draws * (1, n_rays), n_rays, seed & 0xFFFFFFFF, u)
     directions, base_weight, edge_weight = sample_specular(repeated, np.repeat(to_eye, n_rays, axis=0), u)
     origins = spawn_points(snapshot, repeated, directions)
     seed = int(hash_combine(seed, 1))

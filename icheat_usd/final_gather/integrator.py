@@ -23,7 +23,7 @@ from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
 from icheat_usd.final_gather.cached import CachedGather
-from icheat_usd.final_gather.camera_pass import CameraPass
+from icheat_usd.final_gather.camera_pass import CameraPass, draws_of
 from icheat_usd.final_gather.direct_light import DirectLight
 from icheat_usd.final_gather.extras import (
     NO_EXTRAS,
@@ -57,8 +57,8 @@ RAYS_AT_ONCE = 1 << 19
 #: Camera samples that are shaded together, where light is cached.
 SAMPLES_AT_ONCE = 1 << 17
 
-#: What the indirect light of camera samples is found by, from their random counters and a seed.
-FindLight = Callable[[ViewSamples, I64, int], GatheredLight]
+#: What the indirect light of camera samples is found by, from their random counters, sequences and a seed.
+FindLight = Callable[[ViewSamples, I64, I64, int], GatheredLight]
 
 #: Where pilot points are taken from in the picture, at most.
 PILOT_ROWS, PILOT_COLUMNS = 24, 128
@@ -180,7 +180,7 @@ def final_gather(
     for number, ((pixels, view, _), per_light) in enumerate(direct.bands(camera.all())):
         progress("gather", number / len(camera.bands))
         own_seed = int(hash_combine(seed, pixels[0]))
-        bands.append(_band(gatherer, find, view, per_light, pixels, own_seed, extras))
+        bands.append(_band(gatherer, find, view, per_light, draws_of(view, settings), pixels, own_seed, extras))
         if replay is not None:
             kept.append(KeptBand(pixels, view))
     progress("gather", 1.0)
@@ -226,12 +226,15 @@ def _cached(
     return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept), records
 
 
-def _followed(gatherer: Gatherer, view: ViewSamples, stream: I64, seed: int) -> GatheredLight:
-    return gathered_light(gatherer, view.points, view.to_eye, stream, seed)
+def _followed(gatherer: Gatherer, view: ViewSamples, stream: I64, draws: I64, seed: int) -> GatheredLight:
+    return gathered_light(gatherer, view.points, view.to_eye, stream, seed, draws)
 
 
-def _interpolated(gatherer: Gatherer, cached: CachedGather, view: ViewSamples, stream: I64, seed: int) -> GatheredLight:
-    return cached.light(places_of(gatherer.snapshot, gatherer.tracer, view, seed), view.to_eye, stream, seed)
+def _interpolated(
+    gatherer: Gatherer, cached: CachedGather, view: ViewSamples, stream: I64, draws: I64, seed: int
+) -> GatheredLight:
+    places = places_of(gatherer.snapshot, gatherer.tracer, view, seed)
+    return cached.light(places, view.to_eye, stream, draws, seed)
 
 
 def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> SurfacePoints:
@@ -266,11 +269,12 @@ def _band(
     find: FindLight,
     view: ViewSamples,
     per_light: F32,
+    draws: I64,
     pixels: tuple[int, int],
     seed: int,
     extras: Extras,
 ) -> _Band:
-    light = find(view, view.stream.astype(np.int64) & 0x7FFFFFFF, seed)
+    light = find(view, view.stream.astype(np.int64) & 0x7FFFFFFF, draws, seed)
     usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),
