@@ -104,7 +104,9 @@ class DirectLight:
             shown = view.pixel[begin] - first
             of_pixels[:, shown, 0] = np.minimum.reduceat(seen[:, :, 0], begin, axis=1)
             of_pixels[:, shown, 1] = np.maximum.reduceat(seen[:, :, 1], begin, axis=1)
-        by_rows = of_pixels.reshape(n_lights, -1, self._snapshot.camera.width, 2)
+        by_rows = of_pixels.reshape(
+            n_lights, (end - first) // self._snapshot.camera.width, self._snapshot.camera.width, 2
+        )
         return _First(band, parts, draws, light, by_rows)
 
     def _whole(self, first: _First, above: F32 | None, below: F32 | None) -> F32:
@@ -186,4 +188,4 @@ def _disagreeing(extremes: F32, above: F32 | None, below: F32 | None) -> Bool:
     most = np.maximum(np.maximum(most[:, :-2], most[:, 1:-1]), most[:, 2:])
     least = np.minimum(np.minimum(least[:, :, :-2], least[:, :, 1:-1]), least[:, :, 2:])
     most = np.maximum(np.maximum(most[:, :, :-2], most[:, :, 1:-1]), most[:, :, 2:])
-    return np.asarray(least < np.float32(_AGREEING) * most, np.bool_).reshape(n_lights, -1)
+    return np.asarray(least < np.float32(_AGREEING) * most, np.bool_).reshape(n_lights, rows * width)
