@@ -24,6 +24,7 @@ from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
 from icheat_usd.final_gather.cached import CachedGather
 from icheat_usd.final_gather.camera_pass import CameraPass, draws_of
+from icheat_usd.final_gather.contrast import light_edges
 from icheat_usd.final_gather.direct_light import DirectLight
 from icheat_usd.final_gather.extras import (
     NO_EXTRAS,
@@ -221,8 +222,11 @@ def _cached(
     for _, view, _ in camera.first():
         found.append(places_of(snapshot, gatherer.tracer, view, seed))
         pixel.append(view.pixel)
-    placed = overture(cache, join_places(found), np.concatenate(pixel), snapshot.camera.width, progress)
+    places, pixels = join_places(found), np.concatenate(pixel)
+    width, height = snapshot.camera.width, snapshot.camera.height
+    placed = overture(cache, places, pixels, width, progress)
     records = CacheRecords(placed.pixel, cache.table.reach / placed.extent, placed.spacing)
+    camera.sharpen(light_edges(cache, places, pixels, width, width * height))
     return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept), records
 
 
