@@ -247,9 +247,9 @@ class RecordPairs:
             else:
                 sent = np.take(self._sent, np.take(rays.cell.reshape(-1), flat), axis=1)
                 changed = weighted(found.scale, sent) - sent.sum(axis=0)
-            if len(rays.detour):
-                entry = np.minimum(np.searchsorted(rays.detour, flat), len(rays.detour) - 1)
-                went = rays.detour[entry] == flat
+            if len(rays.adjusted):
+                entry = np.minimum(np.searchsorted(rays.adjusted, flat), len(rays.adjusted) - 1)
+                went = rays.adjusted[entry] == flat
                 changed[went] *= rays.throughput[entry[went]]
             out.reshape(-1, 3)[flat] = changed
         return out[rows]

@@ -37,6 +37,7 @@ from icheat_usd.final_gather.gatherer import GatheredLight, Gatherer, GatherSolu
 from icheat_usd.final_gather.hits import trace_hemisphere
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, join_places, overture
 from icheat_usd.final_gather.light_parts import part_layers, with_parts
+from icheat_usd.final_gather.near_hits import NearLight
 from icheat_usd.final_gather.places import places_of
 from icheat_usd.final_gather.record_rays import HemisphereTracer
 from icheat_usd.final_gather.replay import KeptBand, Replay
@@ -215,7 +216,8 @@ def _cached(
     snapshot = gatherer.snapshot
     cells = np.concatenate([gatherer.solution.total, np.zeros((1, 3), np.float32)])
     n_theta, n_phi, own_seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(seed, 0xCAC4E))
-    tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed)
+    near = NearLight(snapshot, gatherer.tracer, gatherer.sampler, gather, gatherer.solution.total, own_seed)
+    tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed, near)
     keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.is_identity
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=keeps_rays)
     found, pixel = [], []

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icheat_usd.final_gather.near_hits import NearLight
 from icheat_usd.kernels import record_rays as kernels
 from icheat_usd.materials import concatenate_points, empty_points, shade_hits, take_points
 from icheat_usd.samples import GatherSamples
@@ -30,8 +31,9 @@ class RecordRays(NamedTuple):
     instance: I32  #: (n, n_rays) first surface, -1 for none
     triangle: I32  #: (n, n_rays)
     uv: F32  #: (n, n_rays, 2)
-    detour: I64  #: (n_detours,) ascending numbers, ``row * n_rays + ray``, of rays that went over mirrors, glass, holes
-    throughput: F32  #: (n_detours, 3) of these
+    adjusted: I64  #: (k,) ascending numbers, ``row * n_rays + ray``, of rays that bring other light than cells
+    throughput: F32  #: (k, 3) what they bring over that: detours, and near hits
+    detour: I64  #: (n_detours,) ascending numbers of rays that went over mirrors, glass, holes
     detour_ends: SurfacePoints  #: (n_detours,) where they end
 
     @property
@@ -50,9 +52,9 @@ class RecordRays(NamedTuple):
         """What each ray brings, (n, n_rays, C), when cells send `of_cells` (n_cells + 1, C), the last row zero."""
         nothing = len(of_cells) - 1
         found = np.take(of_cells, np.where(self.cell < 0, nothing, self.cell), axis=0)
-        if len(self.detour):
+        if len(self.adjusted):
             flat = found.reshape(-1, found.shape[-1])
-            flat[self.detour] *= np.tile(self.throughput, found.shape[-1] // 3)
+            flat[self.adjusted] *= np.tile(self.throughput, found.shape[-1] // 3)
         return found
 
     def ends(self, snapshot: SceneSnapshot, flat: I64) -> SurfacePoints:
@@ -85,14 +87,57 @@ class HemisphereTracer:
     """Traces the rays of records on one scene."""
 
     def __init__(
-        self, snapshot: SceneSnapshot, tracer: Tracer, gather: GatherSamples, n_theta: int, n_phi: int, seed: int
+        self,
+        snapshot: SceneSnapshot,
+        tracer: Tracer,
+        gather: GatherSamples,
+        n_theta: int,
+        n_phi: int,
+        seed: int,
+        near: NearLight | None = None,
     ) -> None:
-        self._snapshot, self._tracer, self._gather = snapshot, tracer, gather
+        self._snapshot, self._tracer, self._gather, self._near = snapshot, tracer, gather, near
         self._n_theta, self._n_phi, self._seed = n_theta, n_phi, seed
         self._route = routed_triangles(snapshot)
 
     def trace(self, points: SurfacePoints, stream: I64) -> RecordRays:
         """Rays from some points; `stream` (n,) numbers their random sequences."""
+        return self._measure_near(self._trace(points, stream))
+
+    def _measure_near(self, rays: RecordRays) -> RecordRays:
+        """Light of near hits, as what it is over the light of their cells: lights have the same shares in both."""
+        if self._near is None:
+            return rays
+        near = self._near.is_near(rays.distance, rays.cell)
+        near.reshape(-1)[rays.detour] = False
+        flat = np.flatnonzero(near)
+        if len(flat) == 0:
+            return rays
+        key = np.empty(len(flat), np.uint64)
+        kernels.patch_keys(
+            rays.position,
+            rays.shading_normal,
+            rays.stream,
+            rays.seed,
+            rays.n_theta,
+            rays.n_phi,
+            rays.distance,
+            rays.cell,
+            flat,
+            key,
+        )
+        order, is_wanted = self._near.wanted(key)
+        new = np.sort(order[is_wanted])
+        if len(new):
+            row, ray = flat[new] // rays.n_rays, flat[new] % rays.n_rays
+            self._near.learn(key[new], rays.ends(self._snapshot, flat[new]), rays.stream[row] * rays.n_rays + ray)
+        sent = np.take(self._near.cells, np.take(rays.cell.reshape(-1), flat), axis=0)
+        throughput = np.divide(self._near.radiance(key), sent, out=np.zeros_like(sent), where=sent > 0)
+        adjusted = np.concatenate([rays.adjusted, flat])
+        order = np.argsort(adjusted, kind="stable")
+        return rays._replace(adjusted=adjusted[order], throughput=np.concatenate([rays.throughput, throughput])[order])
+
+    def _trace(self, points: SurfacePoints, stream: I64) -> RecordRays:
         n, n_rays = len(stream), self._n_theta * self._n_phi
         rays = RecordRays(
             self._n_theta,
@@ -108,6 +153,7 @@ class HemisphereTracer:
             np.empty((n, n_rays, 2), np.float32),
             np.empty(0, np.int64),
             np.empty((0, 3), np.float32),
+            np.empty(0, np.int64),
             empty_points(0),
         )
         trace = self._tracer.compiled()
@@ -150,7 +196,7 @@ class HemisphereTracer:
         cell = self._gather.locate(ends.points)
         np.put(rays.cell, detour, cell)
         throughput = ends.throughput * (cell >= 0)[:, None]
-        return rays._replace(detour=detour, throughput=throughput, detour_ends=ends.points)
+        return rays._replace(adjusted=detour, throughput=throughput, detour=detour, detour_ends=ends.points)
 
     def _one_by_one(self, rays: RecordRays, points: SurfacePoints) -> RecordRays:
         """The same with a tracer that compiled loops cannot call."""
@@ -183,6 +229,7 @@ def concatenate_rays(parts: list[RecordRays]) -> RecordRays:
         )
     }  # fmt: skip
     return first._replace(
+        adjusted=np.concatenate([part.adjusted + begin for part, begin in zip(parts, before, strict=True)]),
         detour=np.concatenate([part.detour + begin for part, begin in zip(parts, before, strict=True)]),
         detour_ends=concatenate_points(*(part.detour_ends for part in parts)),
         **arrays,
@@ -193,15 +240,21 @@ def take_rays(rays: RecordRays, rows: I64) -> RecordRays:
     """Rays of some records, ascending."""
     inside = np.full(len(rays.stream), -1, np.int64)
     inside[rows] = np.arange(len(rows))
-    row = inside[rays.detour // rays.n_rays]
-    kept = np.flatnonzero(row >= 0)
     arrays: dict[str, Any] = {
         name: np.take(getattr(rays, name), rows, axis=0)
         for name in ("stream", "position", "shading_normal", "cell", "distance", "instance", "triangle", "uv")
     }
+
+    def among(numbers: I64) -> tuple[I64, I64]:
+        row = inside[numbers // rays.n_rays]
+        kept = np.flatnonzero(row >= 0)
+        return kept, row[kept] * rays.n_rays + numbers[kept] % rays.n_rays
+
+    adjusted, detour = among(rays.adjusted), among(rays.detour)
     return rays._replace(
-        detour=row[kept] * rays.n_rays + rays.detour[kept] % rays.n_rays,
-        throughput=rays.throughput[kept],
-        detour_ends=take_points(rays.detour_ends, kept),
+        adjusted=adjusted[1],
+        throughput=rays.throughput[adjusted[0]],
+        detour=detour[1],
+        detour_ends=take_points(rays.detour_ends, detour[0]),
         **arrays,
     )

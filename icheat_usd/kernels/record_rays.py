@@ -21,6 +21,7 @@ from icheat_usd.kernels.random import hash_combine, to_unit
 from icheat_usd.kernels.samples import basis, unit_circle
 
 _INVALID = np.uint32(0xFFFFFFFF)
+_TOUCHING = np.float32(1e-6)  # metres: a ray may end where it starts, in a crease
 _BLOCK = 4  # strata along each side of a packet: rays of one cone
 
 
@@ -230,3 +231,30 @@ def hemisphere_directions(shading_normal, row, column, stream, seed, n_theta, n_
         )
         out[q, 0], out[q, 1], out[q, 2] = x, y, z
         counter[q] = np.int32(hash_combine(own, ray))
+
+
+@parallel_kernel
+def patch_keys(position, shading_normal, stream, seed, n_theta, n_phi, distance, cell, flat, out):  # type: ignore[no-untyped-def]
+    """Keys of the patches that rays `flat`, ``row * n_rays + ray``, end in: parts of a cell as wide as a ray is long.
+
+    Widths are powers of two, half a ray's length or more. Different patches share a key with a chance of 2^-64.
+    """
+    for q in prange(len(flat)):
+        r, ray = flat[q] // (n_theta * n_phi), flat[q] % (n_theta * n_phi)
+        own = hash_combine(seed, stream[r])
+        nx, ny, nz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
+        x, y, z = stratum_direction(nx, ny, nz, own, ray // n_phi, ray % n_phi, n_theta, n_phi)
+        d = distance[r, ray]
+        level = np.floor(np.log2(max(d, _TOUCHING)))
+        size = np.float32(2.0**level)
+        key = _mixed(np.uint64(0), np.int64(cell[r, ray]))
+        key = _mixed(key, np.int64(level))
+        key = _mixed(key, np.int64(np.floor((position[r, 0] + d * x) / size)))
+        key = _mixed(key, np.int64(np.floor((position[r, 1] + d * y) / size)))
+        out[q] = _mixed(key, np.int64(np.floor((position[r, 2] + d * z) / size)))
+
+
+@kernel
+def _mixed(key, word):  # type: ignore[no-untyped-def]
+    key = (key ^ np.uint64(word)) * np.uint64(0x9E3779B97F4A7C15)
+    return key ^ (key >> np.uint64(29))

@@ -1,0 +1,111 @@
+"""Light of hits that are much nearer than a gather cell is wide, gathered where they are: a cell is too coarse there.
+
+At contacts, in corners and in narrow gaps light changes within a cell, and most rays of a record end in a few of them.
+A path goes on from such a hit, with direct light at each of its vertices, until it ends further away from the vertex
+before than half a cell is wide (the secondary final gather for nearby surfaces of Jensen 1996, Global Illumination
+using Photon Maps, section 4). Paths are shared: a cell is divided into patches about as wide as the rays that end in
+them are long, and all rays that end in one get the mean of its first few paths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from icheat_usd.final_gather.hits import INVERSE_PI, trace_hemisphere
+from icheat_usd.kernels.random import hash_combine
+from icheat_usd.lighting import LightSampler, irradiance
+from icheat_usd.materials import effective_albedo, take_points
+from icheat_usd.samples import GatherSamples
+from icheat_usd.scene import F32, F64, I32, I64, U64, Bool, SceneSnapshot, SurfacePoints
+from icheat_usd.tracing import Tracer
+
+#: A hit is near if its distance is less than this many widths of the cell that it lies in.
+WIDTHS = 0.5
+
+#: Paths of each patch.
+PATHS = 4
+
+_VERTICES = 3  # of a path between near surfaces, at most
+
+
+@dataclass(eq=False)
+class NearLight:
+    """Radiance of near hits; what is known of a patch serves all later ones.
+
+    Parameters
+    ----------
+    cells : (n_cells, 3) float32
+        Radiance that gather cells send, of all lights.
+    """
+
+    snapshot: SceneSnapshot
+    tracer: Tracer
+    sampler: LightSampler
+    gather: GatherSamples
+    cells: F32
+    seed: int
+    _key: U64 = field(default_factory=lambda: np.empty(0, np.uint64))  #: (p,) ascending
+    _sum: F64 = field(default_factory=lambda: np.empty((0, 3)))  #: (p, 3) of the paths of each patch
+    _number: I64 = field(default_factory=lambda: np.empty(0, np.int64))  #: (p,) of paths
+
+    def __post_init__(self) -> None:
+        widths = np.float32(WIDTHS) * np.sqrt(self.gather.area.astype(np.float32))
+        self._reach = np.append(widths, np.float32(0))
+
+    def is_near(self, distance: F32, cell: I32) -> Bool:
+        """Whether hits in some cells, -1 for none, are near."""
+        return np.asarray(distance < np.take(self._reach, cell), np.bool_)
+
+    def wanted(self, key: U64) -> tuple[I64, Bool]:
+        """Order of hits by patch, and which of them, in that order, need a path."""
+        order = np.argsort(key, kind="stable")
+        ascending = key[order]
+        first = np.flatnonzero(np.concatenate([[True], ascending[1:] != ascending[:-1]]))
+        length = np.diff(np.append(first, len(key)))
+        rank = np.arange(len(key)) - np.repeat(first, length)
+        at = np.minimum(np.searchsorted(self._key, ascending[first]), max(len(self._key) - 1, 0))
+        have = np.zeros(len(first), np.int64)
+        if len(self._key):
+            have = np.where(self._key[at] == ascending[first], self._number[at], 0)
+        return order, rank < np.repeat(PATHS - have, length)
+
+    def learn(self, key: U64, points: SurfacePoints, stream: I64) -> None:
+        """Paths from hits in some patches; `stream` (n,) numbers their random sequences."""
+        light = self._paths(points, stream).astype(np.float64)
+        joined = np.concatenate([self._key, key])
+        self._key, where = np.unique(joined, return_inverse=True)
+        total = np.zeros((len(self._key), 3))
+        number = np.zeros(len(self._key), np.int64)
+        np.add.at(total, where, np.concatenate([self._sum, light]))
+        np.add.at(number, where, np.concatenate([self._number, np.ones(len(key), np.int64)]))
+        self._sum, self._number = total, number
+
+    def radiance(self, key: U64) -> F32:
+        """Radiance of hits in patches that are known, (n, 3)."""
+        mean = (self._sum / self._number[:, None]).astype(np.float32)
+        return np.take(mean, np.searchsorted(self._key, key), axis=0)
+
+    def _paths(self, points: SurfacePoints, stream: I64) -> F32:
+        """Radiance that points reflect, (n, 3), by one path from each."""
+        out = np.zeros((len(stream), 3), np.float32)
+        alive = np.arange(len(stream), dtype=np.int64)
+        carried = np.ones((len(stream), 3), np.float32)
+        for vertex in range(_VERTICES):
+            step = int(hash_combine(self.seed, vertex))
+            carried = carried * effective_albedo(points)
+            direct = irradiance(self.snapshot, self.tracer, self.sampler, points, step, 1).sum(axis=0)
+            out[alive] += carried * direct * INVERSE_PI
+            rays = trace_hemisphere(self.snapshot, self.tracer, points, stream[alive], 1, int(hash_combine(step, 2)))
+            carried = carried * rays.throughput
+            cell = self.gather.locate(rays.ends)
+            distance = np.linalg.norm(rays.ends.position - rays.origins, axis=1).astype(np.float32)
+            goes_on = self.is_near(distance, cell) if vertex + 1 < _VERTICES else np.zeros(len(cell), np.bool_)
+            done = np.flatnonzero((cell >= 0) & ~goes_on)
+            out[alive[done]] += carried[done] * np.take(self.cells, cell[done], axis=0)
+            some = np.flatnonzero(goes_on & carried.any(axis=1))
+            alive, carried, points = alive[some], carried[some], take_points(rays.ends, some)
+            if len(alive) == 0:
+                break
+        return out
