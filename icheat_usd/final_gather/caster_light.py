@@ -213,6 +213,8 @@ class LightByKey:
             rays.stream,
             np.searchsorted(rays.detour, n_rays * np.arange(n + 1)),
             rays.detour,
+            np.searchsorted(rays.adjusted, n_rays * np.arange(n + 1)),
+            rays.adjusted,
             np.ascontiguousarray(rays.throughput, np.float32),
             np.where(lit, ends.instance, np.int32(-1)).astype(np.int32),
             ends.face,

@@ -61,14 +61,17 @@ class Hemispheres:
 
 
 def _rows(rays: RecordRays, some: slice) -> RecordRays:
-    begin, end = np.searchsorted(rays.detour, rays.n_rays * np.array([some.start, some.stop])).tolist()
+    limits = rays.n_rays * np.array([some.start, some.stop])
+    first, last = np.searchsorted(rays.adjusted, limits).tolist()
+    begin, end = np.searchsorted(rays.detour, limits).tolist()
     columns = {
         name: getattr(rays, name)[some]
         for name in ("stream", "position", "shading_normal", "cell", "distance", "instance", "triangle", "uv")
     }
     return rays._replace(
-        detour=rays.detour[begin:end] - some.start * rays.n_rays,
-        throughput=rays.throughput[begin:end],
+        adjusted=rays.adjusted[first:last] - limits[0],
+        throughput=rays.throughput[first:last],
+        detour=rays.detour[begin:end] - limits[0],
         detour_ends=take_points(rays.detour_ends, slice(begin, end)),
         **columns,
     )

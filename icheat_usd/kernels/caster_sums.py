@@ -36,7 +36,9 @@ class RayTable(NamedTuple):
     stream: NDArray[np.int64]  #: (n,)
     detour_begin: NDArray[np.int64]  #: (n + 1,) detours of each row
     detour: NDArray[np.int64]  #: ascending numbers ``row * n_rays + ray``
-    throughput: NDArray[np.float32]  #: (n_detours, 3)
+    adjusted_begin: NDArray[np.int64]  #: (n + 1,) rays of each row that bring other light than cells
+    adjusted: NDArray[np.int64]  #: ascending numbers of these; all lit detours are among them
+    throughput: NDArray[np.float32]  #: (n_adjusted, 3)
     end_instance: NDArray[np.int32]  #: (n_detours,) -1 where nothing sends light
     end_face: NDArray[np.int32]
     end_face_uv: NDArray[np.float32]  #: (n_detours, 2)
@@ -192,6 +194,7 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
     product = np.ones(1 << MOST_MASKS, np.float32)
     value = np.empty(n_channels, np.float64)
     d = rays.detour_begin[r]
+    adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
     for j in range(m):
         for k in range(n):
             ray = j * n + k
@@ -199,13 +202,16 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
             is_detour = d < rays.detour_begin[r + 1] and rays.detour[d] == flat
             if is_detour:
                 d += 1
+            is_adjusted = adjusted < adjusted_end and rays.adjusted[adjusted] == flat
+            if is_adjusted:
+                adjusted += 1
             if local[r, ray] < 0:
                 continue
             cell = rays.cell[r, ray]
             for c in range(n_channels):
                 value[c] = np.float64(sent[cell, c])
-                if is_detour:
-                    value[c] *= rays.throughput[d - 1, c % 3]
+                if is_adjusted:
+                    value[c] *= rays.throughput[adjusted - 1, c % 3]
             # A ray counts in the differences to the four beside it, with one sign or the other.
             far = distance[r, ray]
             before, after = (k - 1 if k > 0 else n - 1), (k + 1 if k + 1 < n else 0)
