@@ -109,10 +109,11 @@ class Pipeline:
         light_samples: int = 16,
         seed: int = 0,
         edge_samples: int = 0,
+        cache: CacheSettings = TINY,
         extras: Extras = NO_EXTRAS,
     ) -> FinalGather:
         settings = GatherSettings(
-            samples, rays, light_samples, self.n_bounces, seed, method=method, edge_samples=edge_samples, cache=TINY
+            samples, rays, light_samples, self.n_bounces, seed, method=method, edge_samples=edge_samples, cache=cache
         )
         field = self.field(*edits)
         needs = method == "cached" or field.uses_incident or field.has_offset

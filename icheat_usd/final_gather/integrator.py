@@ -216,7 +216,10 @@ def _cached(
     snapshot = gatherer.snapshot
     cells = np.concatenate([gatherer.solution.total, np.zeros((1, 3), np.float32)])
     n_theta, n_phi, own_seed = settings.cache.n_theta, settings.cache.n_phi, int(hash_combine(seed, 0xCAC4E))
-    near = NearLight(snapshot, gatherer.tracer, gatherer.sampler, gather, gatherer.solution.total, own_seed)
+    near = None
+    if n_paths := settings.cache.near_paths:
+        total = gatherer.solution.total
+        near = NearLight(snapshot, gatherer.tracer, gatherer.sampler, gather, total, n_paths, own_seed)
     tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed, near)
     keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.is_identity
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=keeps_rays)

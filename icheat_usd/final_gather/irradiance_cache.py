@@ -46,8 +46,11 @@ class CacheSettings:
     most_turn: float = 20.0  #: degrees between normals
     tolerance: float = 0.1  #: relative error of a record's own prediction at another, from which it ends before that
     coverage: float = 0.5  #: sum of weights at a place, 1 at a record itself, from which it needs no record of its own
+    near_paths: int = 4  #: paths from each patch that is nearer than cells resolve; 0: cells are taken for it
 
     def __post_init__(self) -> None:
+        if self.near_paths < 0:
+            raise ValueError(f"near_paths is a number of paths, not {self.near_paths}")
         if self.n_theta < 4 or self.n_theta % 4:
             raise ValueError(f"n_theta is a multiple of 4, not {self.n_theta}")
         if not 0 < self.least_reach <= self.most_reach:

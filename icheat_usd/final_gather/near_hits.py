@@ -24,10 +24,7 @@ from icheat_usd.tracing import Tracer
 #: A hit is near if its distance is less than this many widths of the cell that it lies in.
 WIDTHS = 0.5
 
-#: Paths of each patch.
-PATHS = 4
-
-_VERTICES = 3  # of a path between near surfaces, at most
+_VERTICES = 2  # of a path between near surfaces, at most
 
 
 @dataclass(eq=False)
@@ -38,6 +35,8 @@ class NearLight:
     ----------
     cells : (n_cells, 3) float32
         Radiance that gather cells send, of all lights.
+    n_paths : int
+        Of each patch.
     """
 
     snapshot: SceneSnapshot
@@ -45,6 +44,7 @@ class NearLight:
     sampler: LightSampler
     gather: GatherSamples
     cells: F32
+    n_paths: int
     seed: int
     _key: U64 = field(default_factory=lambda: np.empty(0, np.uint64))  #: (p,) ascending
     _sum: F64 = field(default_factory=lambda: np.empty((0, 3)))  #: (p, 3) of the paths of each patch
@@ -69,7 +69,7 @@ class NearLight:
         have = np.zeros(len(first), np.int64)
         if len(self._key):
             have = np.where(self._key[at] == ascending[first], self._number[at], 0)
-        return order, rank < np.repeat(PATHS - have, length)
+        return order, rank < np.repeat(self.n_paths - have, length)
 
     def learn(self, key: U64, points: SurfacePoints, stream: I64) -> None:
         """Paths from hits in some patches; `stream` (n,) numbers their random sequences."""

@@ -13,7 +13,7 @@ SIZE = 24
 
 
 def stripe(points):
-    """A wall that glows in its upper half alone."""
+    """A box that glows in its upper half alone."""
     return np.where(points.position[:, 1:2] > 0.2, np.float32(1), np.float32(0.02)).repeat(3, axis=1)
 
 

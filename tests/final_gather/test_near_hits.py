@@ -6,17 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from icheat_usd.final_gather import near_hits
 from icheat_usd.final_gather.near_hits import NearLight
 from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import take_points
 from icheat_usd.samples import gather_samples, view_samples
 from icheat_usd.tracing import build_tracer
 from tests.final_gather.test_edits import SCENE
-from tests.pipeline import Pipeline
+from tests.pipeline import TINY, Pipeline
 from tests.scenes import closed_box
 
-ALBEDO, EMISSION = 0.5, 0.3
+ALBEDO, EMISSION, N_PATHS = 0.5, 0.3, 4
 
 
 def test_in_a_furnace_near_hits_send_the_light_of_the_furnace():
@@ -27,15 +26,14 @@ def test_in_a_furnace_near_hits_send_the_light_of_the_furnace():
     gather = gather_samples(snapshot, tracer, view_samples(snapshot, tracer, samples_per_pixel=1, seed=1), n=64)
     reflected = ALBEDO * EMISSION / (1 - ALBEDO)
     cells = np.full((gather.n, 3), reflected, np.float32)
-    near = NearLight(snapshot, tracer, build_light_sampler(snapshot, tracer, points, 0), gather, cells, seed=2)
+    near = NearLight(snapshot, tracer, build_light_sampler(snapshot, tracer, points, 0), gather, cells, N_PATHS, seed=2)
 
     n_patches = 16
     key = np.sort(np.arange(len(points.instance)) % n_patches).astype(np.uint64)
-    near_hits_of = len(key) // n_patches
-    assert near_hits_of > near_hits.PATHS
+    assert len(key) // n_patches > N_PATHS
     order, is_wanted = near.wanted(key)
     chosen = np.sort(order[is_wanted])
-    assert np.bincount(key[chosen].astype(np.int64)).tolist() == [near_hits.PATHS] * n_patches
+    assert np.bincount(key[chosen].astype(np.int64)).tolist() == [N_PATHS] * n_patches
     near.learn(key[chosen], take_points(points, chosen), chosen)
     assert not near.wanted(key)[1].any()
 
@@ -47,13 +45,13 @@ def test_in_a_furnace_near_hits_send_the_light_of_the_furnace():
     assert abs(light.mean() - reflected) < 4 * error
 
 
-def test_where_cells_are_coarse_near_hits_mend_contacts(monkeypatch):
+def test_where_cells_are_coarse_near_hits_mend_contacts():
     scene = replace(SCENE, camera=replace(SCENE.camera, width=24, height=24))
     coarse = Pipeline(scene, n_gather=192)
     halves = [coarse.final(samples=4, rays=256, seed=seed).indirect for seed in (1, 2)]
-    error = {}
-    for widths in (near_hits.WIDTHS, 0.0):
-        monkeypatch.setattr(near_hits, "WIDTHS", widths)
-        found = coarse.final(method="cached", samples=4).indirect
-        error[widths] = ((found - halves[0]) * (found - halves[1])).mean()
-    assert error.pop(0.0) > 1.3 * error.popitem()[1] > 0
+    error = []
+    for n_paths in (0, 4):
+        cache = replace(TINY, near_paths=n_paths)
+        found = coarse.final(method="cached", samples=4, cache=cache).indirect
+        error.append(((found - halves[0]) * (found - halves[1])).mean())
+    assert error[0] > 1.3 * error[1] > 0

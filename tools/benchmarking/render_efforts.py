@@ -28,7 +28,12 @@ EFFORTS: dict[str, RenderEffort] = {
         4_096,
         32,
         1,
-        GatherSettings(1, light_samples=1, edge_samples=4, cache=CacheSettings(n_theta=8, noise=0.1, least_reach=3.0)),
+        GatherSettings(
+            1,
+            light_samples=1,
+            edge_samples=4,
+            cache=CacheSettings(n_theta=8, noise=0.1, least_reach=3.0, near_paths=0),
+        ),
     ),
     "cached 1": _cached(
         8_192, 64, 2, GatherSettings(1, light_samples=1, edge_samples=8, cache=CacheSettings(noise=0.05))
