@@ -25,21 +25,16 @@ def _cached(n_gather: int, bounce_rays: int, light_samples: int, settings: Gathe
 EFFORTS: dict[str, RenderEffort] = {
     "brute 4 x 16": RenderEffort(GatherSettings(method="brute", samples_per_pixel=4, gather_rays=16), PREVIEW),
     "cached 0": _cached(
-        4_096,
+        8_192,
         32,
         1,
-        GatherSettings(
-            1,
-            light_samples=1,
-            edge_samples=4,
-            cache=CacheSettings(n_theta=8, noise=0.1, least_reach=3.0, near_paths=0),
-        ),
+        GatherSettings(1, light_samples=1, edge_samples=4, cache=CacheSettings(n_theta=8, noise=0.1, least_reach=3.0)),
     ),
     "cached 1": _cached(
-        8_192, 64, 2, GatherSettings(1, light_samples=1, edge_samples=8, cache=CacheSettings(noise=0.05))
+        32_768, 64, 2, GatherSettings(1, light_samples=1, edge_samples=8, cache=CacheSettings(noise=0.05))
     ),
     "cached 2": _cached(
-        32_768, 64, 4, GatherSettings(1, light_samples=2, edge_samples=12, cache=CacheSettings(noise=0.03))
+        65_536, 64, 4, GatherSettings(1, light_samples=2, edge_samples=12, cache=CacheSettings(noise=0.03))
     ),
     "cached 3": _cached(
         65_536, 128, 8, GatherSettings(2, light_samples=2, edge_samples=16, cache=CacheSettings(noise=0.015))
