@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from icheat_usd import __version__
+from icheat_usd.cli.interrupts import dropped_interrupts_again
 from icheat_usd.errors import IcheatError
 
 #: Modules of `icheat_usd.cli`, in the order of the help; each has a docstring (its help), `setup_parser` and `command`.
@@ -101,7 +102,8 @@ def run(arguments: list[str] | None = None) -> int:
     except SystemExit as end:  # --help, --version
         return int(end.code or 0)
     try:
-        status = int(options.command(options))
+        with dropped_interrupts_again():
+            status = int(options.command(options))
         sys.stdout.flush()
         return status
     except KeyboardInterrupt:
