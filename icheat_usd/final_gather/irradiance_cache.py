@@ -17,7 +17,7 @@ from icheat_usd.kernels import irradiance_cache as kernels
 from icheat_usd.kernels import record_sums
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
-from icheat_usd.scene import F32, I32, I64, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
 
 _COARSEST = 32  # pixels between the first places that are looked at
 _RAYS_AT_ONCE = 1 << 19
@@ -198,8 +198,17 @@ class IrradianceCache:
         )
         if self.n:
             limit = places.limit(self.settings)
-            kernels.find_records(self.table, self._hash(), position, normal, limit, *found)
+            kernels.find_records(self._hash(), position, normal, limit, *found)
         return found
+
+    def covers(self, places: Places) -> Bool:
+        """(m,) whether records reach some places so well that these need none of their own."""
+        out = np.zeros(len(places.extent), np.uint8)
+        if self.n:
+            position, normal = places.points.position, places.points.shading_normal
+            wanted = np.float32(self.settings.coverage)
+            kernels.find_covered(self._hash(), position, normal, places.limit(self.settings), wanted, out)
+        return out != 0
 
     def interpolate(
         self, found: Lookup, position: F32, normal: F32, values: RecordValues | None = None, slot: I32 | None = None
@@ -342,10 +351,11 @@ class IrradianceCache:
             n = kernels.list_keys(self.table.position, reach, level, key, record)
             order = np.argsort(key[:n], kind="stable")
             size = 1 << int(np.ceil(np.log2(2 * n + 1)))
-            table = np.full(size, -1, np.int64)
-            begin, end = np.zeros(size, np.int32), np.zeros(size, np.int32)
-            kernels.fill_hash(key[order], table, begin, end)
-            self._index = kernels.RecordHash(np.unique(level), table, begin, end, record[order])
+            slot = np.full((size, 3), -1, np.int64)
+            kernels.fill_hash(key[order], slot)
+            row = np.zeros((self.n, kernels.ROW), np.float32)
+            np.concatenate([c.reshape(self.n, -1) for c in self.table], axis=1, out=row[:, :9])
+            self._index = kernels.RecordHash(np.unique(level), slot, record[order], row)
         return self._index
 
 
@@ -382,7 +392,7 @@ def fill(cache: IrradianceCache, places: Places, due: I64) -> I64:
     if len(due) == 0:
         return due
     some = places.take(due)
-    new = np.flatnonzero(cache.find(some).coverage < cache.settings.coverage)
+    new = np.flatnonzero(~cache.covers(some))
     if len(new):
         cache.add(some.take(new))
     return due[new]

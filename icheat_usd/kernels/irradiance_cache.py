@@ -34,10 +34,15 @@ class RecordHash(NamedTuple):
     """Which records reach into each cell of grids of many sizes."""
 
     level: NDArray[np.int64]  #: sizes in use, log2 of metres
-    key: NDArray[np.int64]  #: (size,) -1 is empty; size is a power of two
-    begin: NDArray[np.int32]  #: (size + 1,) see `record`; list of slot s is ``begin[s]:end[s]``
-    end: NDArray[np.int32]
+    slot: NDArray[
+        np.int64
+    ]  #: (size, 3) key, and its list ``record[begin:end]``; key -1 is empty; size is a power of two
     record: NDArray[np.int32]
+    row: NDArray[np.float32]  #: (n, `ROW`) position, normal, reach, turn, trust of each record, in one cache line
+
+
+#: Width of the rows of `RecordHash`.
+ROW = 12
 
 
 @parallel_kernel
@@ -80,10 +85,15 @@ def _clamped(i, position, reach, old):  # type: ignore[no-untyped-def]
 @kernel
 def cell_key(level, x, y, z):  # type: ignore[no-untyped-def]
     """Cell of a place in the grid of one size. Far cells may share a key, which costs time only."""
-    size = 2.0**level
-    i, j, k = np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
+    return _key_in(np.int64(level), 2.0**-level, x, y, z)
+
+
+@kernel
+def _key_in(level, scale, x, y, z):  # type: ignore[no-untyped-def]
+    """`cell_key`; `scale` is one over the size of a cell, a power of two."""
+    i, j, k = np.int64(np.floor(x * scale)), np.int64(np.floor(y * scale)), np.int64(np.floor(z * scale))
     mask = np.int64((1 << 18) - 1)
-    return ((np.int64(level) + 64) << 54) | ((i & mask) << 36) | ((j & mask) << 18) | (k & mask)
+    return ((level + 64) << 54) | ((i & mask) << 36) | ((j & mask) << 18) | (k & mask)
 
 
 @kernel
@@ -92,7 +102,7 @@ def _slot_of(key, table):  # type: ignore[no-untyped-def]
     mask = np.int64(len(table) - 1)
     word = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     slot = np.int64(word >> np.uint64(20)) & mask
-    while table[slot] != _EMPTY and table[slot] != key:
+    while table[slot, 0] != _EMPTY and table[slot, 0] != key:
         slot = (slot + 1) & mask
     return slot
 
@@ -118,8 +128,8 @@ def list_keys(position, reach, level, key, record):  # type: ignore[no-untyped-d
 
 
 @kernel
-def fill_hash(keys, table, begin, end):  # type: ignore[no-untyped-def]
-    """Enter ascending `keys`, equal ones as one list."""
+def fill_hash(keys, table):  # type: ignore[no-untyped-def]
+    """Enter ascending `keys`, equal ones as one list, into the slots of a `RecordHash`."""
     n = len(keys)
     e = 0
     while e < n:
@@ -127,42 +137,41 @@ def fill_hash(keys, table, begin, end):  # type: ignore[no-untyped-def]
         while last < n and keys[last] == keys[e]:
             last += 1
         slot = _slot_of(keys[e], table)
-        table[slot] = keys[e]
-        begin[slot] = e
-        end[slot] = last
+        table[slot, 0], table[slot, 1], table[slot, 2] = keys[e], e, last
         e = last
 
 
 @kernel
-def _weight(position, normal, reach, turn, trust, r, limit, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+def _weight(row, r, limit, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Weight of a record at a place, 0 to 1; it ends smoothly where the record or the place's own limit does."""
-    dx, dy, dz = x - position[r, 0], y - position[r, 1], z - position[r, 2]
+    dx, dy, dz = x - row[r, 0], y - row[r, 1], z - row[r, 2]
     d2 = dx * dx + dy * dy + dz * dz
-    far = min(reach[r], limit)
+    far = min(row[r, 6], limit)
     if d2 >= far * far:
         return np.float32(0.0)
-    mx, my, mz = normal[r, 0], normal[r, 1], normal[r, 2]
+    mx, my, mz = row[r, 3], row[r, 4], row[r, 5]
+    turn = row[r, 7]
     turned = np.float32(1.0) - (nx * mx + ny * my + nz * mz)
-    if turned >= turn[r]:
+    if turned >= turn:
         return np.float32(0.0)
     height = np.float32(0.5) * (dx * (nx + mx) + dy * (ny + my) + dz * (nz + mz))
     if abs(height) > _STEP * far:
         return np.float32(0.0)
     # Turns count from the noise of float32 normals on.
-    error = np.float32(np.sqrt(d2)) / far + np.float32(np.sqrt(max(turned, np.float32(0.0)) / turn[r]))
+    error = np.float32(np.sqrt(d2)) / far + np.float32(np.sqrt(max(turned, np.float32(0.0)) / turn))
     if error >= np.float32(1.0):
         return np.float32(0.0)
     left = np.float32(1.0) - error
-    return trust[r] * left
+    return row[r, 8] * left
 
 
 @parallel_kernel
-def find_records(table, index, position, normal, limit, count, record, weight, coverage):  # type: ignore[no-untyped-def]
+def find_records(index, position, normal, limit, count, record, weight, coverage):  # type: ignore[no-untyped-def]
     """Records that reach each of m places, and weights that add up to 1.
 
     Parameters
     ----------
-    table, index : RecordTable, RecordHash
+    index : RecordHash
     position, normal : (m, 3) float32
         World space; shading normals.
     limit : (m,) float32
@@ -171,19 +180,15 @@ def find_records(table, index, position, normal, limit, count, record, weight, c
     coverage : (m,) float32, out
         Sum of the weights before.
     """
+    scale = 2.0**-index.level
     for p in prange(len(position)):
         _find_at(
             p,
-            table.position,
-            table.normal,
-            table.reach,
-            table.turn,
-            table.trust,
             index.level,
-            index.key,
-            index.begin,
-            index.end,
+            scale,
+            index.slot,
             index.record,
+            index.row,
             position,
             normal,
             limit,
@@ -196,36 +201,19 @@ def find_records(table, index, position, normal, limit, count, record, weight, c
 
 @kernel
 def _find_at(  # type: ignore[no-untyped-def]
-    p,
-    at,
-    facing,
-    reach,
-    turn,
-    trust,
-    levels,
-    keys,
-    begin,
-    end,
-    listed,
-    position,
-    normal,
-    limit,
-    count,
-    record,
-    weight,
-    coverage,
+    p, levels, scale, slots, listed, rows, position, normal, limit, count, record, weight, coverage
 ):
     x, y, z = position[p, 0], position[p, 1], position[p, 2]
     nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
     n = 0
     total = np.float32(0.0)
     for q in range(len(levels)):
-        slot = _slot_of(cell_key(levels[q], x, y, z), keys)
-        if keys[slot] == _EMPTY:
+        slot = _slot_of(_key_in(levels[q], scale[q], x, y, z), slots)
+        if slots[slot, 0] == _EMPTY:
             continue
-        for e in range(begin[slot], end[slot]):
+        for e in range(slots[slot, 1], slots[slot, 2]):
             r = listed[e]
-            w = _weight(at, facing, reach, turn, trust, r, limit[p], x, y, z, nx, ny, nz)
+            w = _weight(rows, r, limit[p], x, y, z, nx, ny, nz)
             if not w > np.float32(0.0):
                 continue
             total += w
@@ -246,6 +234,36 @@ def _find_at(  # type: ignore[no-untyped-def]
         kept += weight[p, k]
     for k in range(n):
         weight[p, k] /= kept
+
+
+@parallel_kernel
+def find_covered(index, position, normal, limit, wanted, out):  # type: ignore[no-untyped-def]
+    """Whether the records that reach a place have weights that add up to `wanted` before they are scaled.
+
+    As `find_records` has it; `out` (m,) uint8.
+    """
+    scale = 2.0**-index.level
+    for p in prange(len(position)):
+        out[p] = _is_covered(
+            p, index.level, scale, index.slot, index.record, index.row, position, normal, limit, wanted
+        )
+
+
+@kernel
+def _is_covered(p, levels, scale, slots, listed, rows, position, normal, limit, wanted):  # type: ignore[no-untyped-def]
+    x, y, z = position[p, 0], position[p, 1], position[p, 2]
+    nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
+    total = np.float32(0.0)
+    # Records in the open, which reach far, cover most places.
+    for q in range(len(levels) - 1, -1, -1):
+        slot = _slot_of(_key_in(levels[q], scale[q], x, y, z), slots)
+        if slots[slot, 0] == _EMPTY:
+            continue
+        for e in range(slots[slot, 1], slots[slot, 2]):
+            total += _weight(rows, listed[e], limit[p], x, y, z, nx, ny, nz)
+            if total >= wanted:
+                return np.uint8(1)
+    return np.uint8(0)
 
 
 @parallel_kernel
