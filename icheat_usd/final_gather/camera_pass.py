@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,13 +14,16 @@ from icheat_usd.samples import ViewSamples, view_samples
 from icheat_usd.samples.adaptive import edge_pixels, join_looks, look_over
 from icheat_usd.samples.pixel_filter import PixelFilter
 from icheat_usd.samples.view import SkyPaths
-from icheat_usd.scene import I64, SceneSnapshot
+from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 
 #: Camera samples that are kept from the first pass for the second, of all bands; 200 bytes each.
 _KEPT = 2_000_000
 
 _NO_EDGES: I64 = np.empty(0, np.int64)
+
+#: Something that is to be known of every view sample, (n,): how near the next surface is.
+Measure = Callable[[ViewSamples], F32]
 
 
 class Band(NamedTuple):
@@ -29,6 +32,7 @@ class Band(NamedTuple):
     pixels: tuple[int, int]  #: the first and the one behind the last, row-major: whole rows
     view: ViewSamples
     edges: I64  #: (m,) ascending: pixels with more samples than the others
+    measured: F32  #: (n,) of each view sample; zeros where nothing is measured
 
 
 class CameraPass:
@@ -40,10 +44,18 @@ class CameraPass:
         More samples of pixels with edges.
     band : int
         Samples per band, about.
+    measure : Measure, optional
+        What is to be known of every sample, and found once.
     """
 
     def __init__(
-        self, snapshot: SceneSnapshot, tracer: Tracer, settings: GatherSettings, n_edge: int, band: int
+        self,
+        snapshot: SceneSnapshot,
+        tracer: Tracer,
+        settings: GatherSettings,
+        n_edge: int,
+        band: int,
+        measure: Measure = lambda view: np.zeros(view.n, np.float32),
     ) -> None:
         self._snapshot, self._tracer, self._settings = snapshot, tracer, settings
         self._n, self._n_edge, n = settings.samples_per_pixel, n_edge, settings.samples_per_pixel
@@ -56,7 +68,8 @@ class CameraPass:
         n_pixels = camera.width * camera.height
         pixels = max(1, band // n // camera.width) * camera.width
         self.bands = [(first, min(first + pixels, n_pixels)) for first in range(0, n_pixels, pixels)]
-        self._kept: dict[int, ViewSamples] = {}
+        self._measure = measure
+        self._kept: dict[int, tuple[ViewSamples, F32]] = {}
         self._edges = _NO_EDGES
         self._is_kept = n_pixels * n <= _KEPT
 
@@ -65,11 +78,12 @@ class CameraPass:
         looks = []
         for number, pixels in enumerate(self.bands):
             view = self._trace(pixels, self._n, self._first)
+            measured = self._measure(view)
             if self._is_kept:
-                self._kept[number] = view
+                self._kept[number] = view, measured
             if self._n_edge:
                 looks.append(look_over(view, self._snapshot.camera, pixels))
-            yield Band(pixels, view, _NO_EDGES)
+            yield Band(pixels, view, _NO_EDGES, measured)
         if looks:
             self._edges = edge_pixels(join_looks(*looks), self._snapshot.camera.width)
 
@@ -81,14 +95,19 @@ class CameraPass:
     def all(self) -> Iterator[Band]:
         """All samples, after `first` has been gone through."""
         for number, pixels in enumerate(self.bands):
-            view = self._kept.pop(number, None)
-            if view is None:
+            if number in self._kept:
+                view, measured = self._kept.pop(number)
+            else:
                 view = self._trace(pixels, self._n, self._first)
+                measured = self._measure(view)
             begin, end = np.searchsorted(self._edges, pixels)
             edges = self._edges[begin:end]
             if len(edges):
-                view = _joined(view, self._trace(edges, self._n_edge, self._first_edge), edges)
-            yield Band(pixels, view, edges)
+                more = self._trace(edges, self._n_edge, self._first_edge)
+                both = np.concatenate([measured, self._measure(more)])
+                view, order = _joined(view, more, edges)
+                measured = both[order]
+            yield Band(pixels, view, edges, measured)
 
     def _trace(self, pixels: tuple[int, int] | I64, n: int, first: int) -> ViewSamples:
         return view_samples(
@@ -119,8 +138,8 @@ def draws_of(view: ViewSamples, settings: GatherSettings) -> I64:
     return np.stack([view.pixel.astype(np.int64), number], axis=1)
 
 
-def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> ViewSamples:
-    """Samples of both; in `pixels`, which `more` has, each counts as much as any other."""
+def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> tuple[ViewSamples, I64]:
+    """Samples of both, and which each was; in `pixels`, which `more` has, each counts as much as any other."""
     n, m = view.samples_per_pixel, more.samples_per_pixel
     has_more = np.zeros(view.width * view.height, bool)
     has_more[pixels] = True
@@ -140,7 +159,7 @@ def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> ViewSamples:
     )
     background = view.background * scale[:, None]
     background[pixels] += more.background[pixels] * rest
-    return replace(
+    joined = replace(
         view,
         pixel=pixel[order],
         throughput=np.ascontiguousarray(throughput[order]),
@@ -151,3 +170,4 @@ def _joined(view: ViewSamples, more: ViewSamples, pixels: I64) -> ViewSamples:
         stream=both(view.stream, more.stream),
         sky=sky,
     )
+    return joined, order

@@ -23,7 +23,7 @@ from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
 from icheat_usd.final_gather.cached import CachedGather
-from icheat_usd.final_gather.camera_pass import CameraPass, draws_of
+from icheat_usd.final_gather.camera_pass import Band, CameraPass, draws_of
 from icheat_usd.final_gather.contrast import light_edges
 from icheat_usd.final_gather.direct_light import DirectLight
 from icheat_usd.final_gather.extras import (
@@ -35,10 +35,10 @@ from icheat_usd.final_gather.extras import (
 )
 from icheat_usd.final_gather.gatherer import GatheredLight, Gatherer, GatherSolution, gathered_light
 from icheat_usd.final_gather.hits import trace_hemisphere
-from icheat_usd.final_gather.irradiance_cache import IrradianceCache, join_places, overture
+from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Places, join_places, overture
 from icheat_usd.final_gather.light_parts import part_layers, with_parts
 from icheat_usd.final_gather.near_hits import NearLight
-from icheat_usd.final_gather.places import places_of
+from icheat_usd.final_gather.places import near_of, pixel_extent
 from icheat_usd.final_gather.record_rays import HemisphereTracer
 from icheat_usd.final_gather.replay import KeptBand, Replay
 from icheat_usd.final_gather.settings import GatherSettings
@@ -47,9 +47,9 @@ from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
-from icheat_usd.samples import GatherSamples, ViewSamples, view_samples
+from icheat_usd.samples import GatherSamples, view_samples
 from icheat_usd.samples.develop import average, develop
-from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, I64, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, build_tracer
 from icheat_usd.transport import sum_groups
 
@@ -59,8 +59,8 @@ RAYS_AT_ONCE = 1 << 19
 #: Camera samples that are shaded together, where light is cached.
 SAMPLES_AT_ONCE = 1 << 17
 
-#: What the indirect light of camera samples is found by, from their random counters, sequences and a seed.
-FindLight = Callable[[ViewSamples, I64, I64, int], GatheredLight]
+#: What the indirect light of a band is found by, from random counters and sequences of its samples and a seed.
+FindLight = Callable[[Band, I64, I64, int], GatheredLight]
 
 #: Where pilot points are taken from in the picture, at most.
 PILOT_ROWS, PILOT_COLUMNS = 24, 128
@@ -149,7 +149,9 @@ def final_gather(
             "the cached method and this edit stack need the gather-sample solution: pass gather and gather_radiance"
         )
     progress("gather", 0.0)
-    sampler = build_light_sampler(snapshot, tracer, _pilot_points(snapshot, tracer, settings.seed), settings.seed)
+    # Only domes are learnt about.
+    pilot = _pilot_points(snapshot, tracer, settings.seed) if (snapshot.lights.kind == LightKind.DOME).any() else None
+    sampler = build_light_sampler(snapshot, tracer, pilot, settings.seed)
     gatherer = Gatherer(
         snapshot,
         tracer,
@@ -167,9 +169,12 @@ def final_gather(
         gatherer = with_parts(gatherer, extras.light_groups, gather_radiance)
     band = SAMPLES_AT_ONCE if is_cached else max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
     n_edge = settings.edge_samples if is_cached else 0
-    camera = CameraPass(snapshot, tracer, settings, n_edge, band)
     # Errors of images that are parts of one are to cancel.
     seed = settings.seed if settings.first_sample is None else int(hash_combine(settings.seed, settings.first_sample))
+    near: dict[str, Any] = {}
+    if is_cached:
+        near["measure"] = partial(near_of, snapshot, tracer, seed=seed, most_reach=settings.cache.most_reach)
+    camera = CameraPass(snapshot, tracer, settings, n_edge, band, **near)
     find: FindLight = partial(_followed, gatherer)
     bands: list[_Band] = []
     kept: list[KeptBand] = []
@@ -179,12 +184,12 @@ def final_gather(
         find = partial(_interpolated, gatherer, cached)
         replay = Replay(gatherer, cached, kept, gather_radiance) if is_kept else None
     direct = DirectLight(snapshot, tracer, sampler, settings)
-    for number, ((pixels, view, _), per_light) in enumerate(direct.bands(camera.all())):
+    for number, (part, per_light) in enumerate(direct.bands(camera.all())):
         progress("gather", number / len(camera.bands))
-        own_seed = int(hash_combine(seed, pixels[0]))
-        bands.append(_band(gatherer, find, view, per_light, draws_of(view, settings), pixels, own_seed, extras))
+        own_seed = int(hash_combine(seed, part.pixels[0]))
+        bands.append(_band(gatherer, find, part, per_light, draws_of(part.view, settings), own_seed, extras))
         if replay is not None:
-            kept.append(KeptBand(pixels, view))
+            kept.append(KeptBand(part.pixels, part.view))
     progress("gather", 1.0)
     shape = (snapshot.camera.height, snapshot.camera.width, -1)
 
@@ -224,9 +229,9 @@ def _cached(
     keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.is_identity
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=keeps_rays)
     found, pixel = [], []
-    for _, view, _ in camera.first():
-        found.append(places_of(snapshot, gatherer.tracer, view, seed))
-        pixel.append(view.pixel)
+    for band in camera.first():
+        found.append(_places(snapshot, band))
+        pixel.append(band.view.pixel)
     places, pixels = join_places(found), np.concatenate(pixel)
     width, height = snapshot.camera.width, snapshot.camera.height
     placed = overture(cache, places, pixels, width, progress)
@@ -235,15 +240,18 @@ def _cached(
     return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept), records
 
 
-def _followed(gatherer: Gatherer, view: ViewSamples, stream: I64, draws: I64, seed: int) -> GatheredLight:
-    return gathered_light(gatherer, view.points, view.to_eye, stream, seed, draws)
+def _places(snapshot: SceneSnapshot, band: Band) -> Places:
+    return Places(band.view.points, pixel_extent(snapshot.camera, band.view), band.measured)
+
+
+def _followed(gatherer: Gatherer, band: Band, stream: I64, draws: I64, seed: int) -> GatheredLight:
+    return gathered_light(gatherer, band.view.points, band.view.to_eye, stream, seed, draws)
 
 
 def _interpolated(
-    gatherer: Gatherer, cached: CachedGather, view: ViewSamples, stream: I64, draws: I64, seed: int
+    gatherer: Gatherer, cached: CachedGather, band: Band, stream: I64, draws: I64, seed: int
 ) -> GatheredLight:
-    places = places_of(gatherer.snapshot, gatherer.tracer, view, seed)
-    return cached.light(places, view.to_eye, stream, draws, seed)
+    return cached.light(_places(gatherer.snapshot, band), band.view.to_eye, stream, draws, seed)
 
 
 def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> SurfacePoints:
@@ -274,16 +282,10 @@ def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | N
 
 
 def _band(
-    gatherer: Gatherer,
-    find: FindLight,
-    view: ViewSamples,
-    per_light: F32,
-    draws: I64,
-    pixels: tuple[int, int],
-    seed: int,
-    extras: Extras,
+    gatherer: Gatherer, find: FindLight, band: Band, per_light: F32, draws: I64, seed: int, extras: Extras
 ) -> _Band:
-    light = find(view, view.stream.astype(np.int64) & 0x7FFFFFFF, draws, seed)
+    pixels, view = band.pixels, band.view
+    light = find(band, view.stream.astype(np.int64) & 0x7FFFFFFF, draws, seed)
     usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),

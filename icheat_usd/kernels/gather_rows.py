@@ -158,6 +158,7 @@ def trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words,
         for c in range(17, 21):
             single_words[c] = _INVALID
         call_1(trace.function, trace.scene, single_at)
+        rays[8, k] = single[8]
         for c in range(15, 17):
             rays[c, k] = single[c]
         for c in range(17, 21):

@@ -16,10 +16,10 @@ from icheat_usd.samples.cell_map import HitCells
 from icheat_usd.samples.locate import Locator, build_locator
 from icheat_usd.samples.tree import ClusterTree, build_tree, split_samples
 from icheat_usd.samples.view import ViewSamples
-from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, F64, I32, I64, Bool, Camera, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 
-_PILOT_POINTS = 16384
+_PILOT_POINTS = 16384  # at most, of the view that a pilot starts from
 _PILOT_RAYS = 1 << 17  # in all: enough to find a surface that fills a 10,000th of what all points see
 _AREA_SHARE = 0.2  # of the samples by area alone: what the pilot missed still gets some
 _UNSEEN_SHARE = 0.25  # of the samples at most, for sides that the pilot never saw
@@ -82,7 +82,7 @@ def gather_samples(
 ) -> GatherSamples:
     """Spread gather samples where they matter to the view.
 
-    A pilot of gather rays from some view samples, and one more bounce,
+    A pilot of gather rays from the samples of `pilot_pixels`, and one more bounce,
     measures how much of what the view receives comes from each side of each
     instance. Samples are shared out by that (and a fifth by area); on a side
     they are uniform in area. Every side has one sample or more as long as `n`
@@ -90,6 +90,8 @@ def gather_samples(
 
     Parameters
     ----------
+    view
+        Of all pixels, or of the pilot's alone: the result is the same.
     n
         Cells wanted; there are never more.
     n_patches_per_cell
@@ -176,6 +178,17 @@ def cell_direct(
     return out
 
 
+def pilot_pixels(camera: Camera, samples_per_pixel: int = 1) -> I64:
+    """Pixels of a view that gather samples are spread by, ascending."""
+    pixels = np.arange(camera.width * camera.height, dtype=np.int64)
+    return pixels[_is_pilot(len(pixels), samples_per_pixel, pixels)]
+
+
+def _is_pilot(n_pixels: int, samples_per_pixel: int, pixel: I32 | I64) -> Bool:
+    step = max(1, -(-n_pixels * samples_per_pixel // _PILOT_POINTS))
+    return np.asarray(pixel % step == step // 2)
+
+
 def _depth_bound(n: int) -> int:
     """Nodes on the way down within a slot, which is split at its median."""
     return int(n).bit_length() + 1
@@ -186,8 +199,7 @@ def _pilot(snapshot: SceneSnapshot, tracer: Tracer, view: ViewSamples, seed: int
     importance = np.zeros(2 * snapshot.n_instances, np.float64)
     if view.n == 0:
         return importance
-    step = max(1, view.n // _PILOT_POINTS)
-    points = take_points(view.points, np.arange(step // 2, view.n, step))
+    points = take_points(view.points, _is_pilot(view.width * view.height, view.samples_per_pixel, view.pixel))
     weight = np.ones(len(points.instance))
     rays_per_point = min(1024, max(1, _PILOT_RAYS // len(weight)))
     for bounce, n_rays in enumerate((rays_per_point, 1)):

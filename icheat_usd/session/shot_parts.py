@@ -16,6 +16,7 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.relight import Relighter
 from icheat_usd.relight.relighter import light_view
 from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct, gather_samples, view_samples
+from icheat_usd.samples.gather import pilot_pixels
 from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.session.content_keys import ShotKeys, shot_keys
 from icheat_usd.session.disk_cache import DiskCache, Shelf
@@ -115,11 +116,13 @@ class ShotParts:
     @cached_property
     def gather(self) -> GatherSamples:
         def make(_: Shelf | None) -> GatherSamples:
-            n, seed = self.quality.n_gather, self.quality.seed
+            n, seed, samples = self.quality.n_gather, self.quality.seed, self.quality.samples_per_pixel
             self.progress("place gather samples", 0.0)
-            return gather_samples(self.snapshot, self.tracer, self.view, n=n, seed=seed)
+            pixels = pilot_pixels(self.snapshot.camera, samples)
+            view = view_samples(self.snapshot, self.tracer, samples_per_pixel=samples, seed=seed, pixels=pixels)
+            return gather_samples(self.snapshot, self.tracer, view, n=n, seed=seed)
 
-        return self._kept("gather", ("view",), make)
+        return self._kept("gather", ("tracer",), make)
 
     @cached_property
     def training(self) -> F32:
