@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from icheat_usd.edits.bound import Aggregate, BoundEdit, Ends, StackCoefficients
 from icheat_usd.edits.composing import ONE, State, lay, pair_weights
+from icheat_usd.edits.mask_table import mask_table, weights_of
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.operations import Level, PairCoefficients, PairEnd
 from icheat_usd.edits.operations.division import divide
+from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.scene import F32, I64, Finding, SurfacePoints
 
 
@@ -36,6 +39,11 @@ class EditField:
     @property
     def is_identity(self) -> bool:
         return not self.edits
+
+    @property
+    def acts_on_views_alone(self) -> bool:
+        """True if a renderer needs to know nothing of pairs."""
+        return all(bound.level is Level.VIEW for bound in self.edits)
 
     @property
     def uses_incident(self) -> bool:
@@ -120,7 +128,14 @@ class EditField:
 
     def receiver_masks(self, points: SurfacePoints) -> F32:
         """Soft receiver masks u alone, (n_rows, n)."""
-        return self.receivers(points).masks
+        if self.uses_receiver or self._receiver_table is None:
+            return self.receivers(points).masks
+        return weights_of(self._receiver_table, self.n_rows, points).T
+
+    @cached_property
+    def _receiver_table(self) -> MaskTable | None:
+        selections = [receivers for bound in self.edits for receivers in bound.receivers]
+        return mask_table(selections, len(selections[0].on_instances)) if selections else None
 
     # Pairs
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.edits.offsets import offset_radiance
-from icheat_usd.final_gather.edited_records import EditedRecords
+from icheat_usd.final_gather.edited_records import EditedRecords, MaskedRecords, edited_records
 from icheat_usd.final_gather.gatherer import (
     GatheredLight,
     Gatherer,
@@ -50,7 +50,7 @@ class CachedGather:
         self.hemispheres = hemispheres_of(cache)
         self._parts.take_edits(self.hemispheres)
         stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
-        self._stacks = [(stack, EditedRecords(stack, cache, self.hemispheres)) for stack in stacks]
+        self._stacks = [(stack, edited_records(stack, cache, self.hemispheres)) for stack in stacks]
 
     def light(self, places: Places, to_eye: F32, stream: I64, draws: I64, seed: int) -> GatheredLight:
         """Radiance towards the eye; points that no edit touches have the same bits in both results."""
@@ -101,7 +101,7 @@ class Sampled(NamedTuple):
     own_rays: Hemispheres | None  #: of these
 
 
-def under_stack(g: Gatherer, records: EditedRecords, sampled: Sampled) -> F32:
+def under_stack(g: Gatherer, records: MaskedRecords | EditedRecords, sampled: Sampled) -> F32:
     """Light of camera samples under the stack of a gatherer, (n, 3); where no edit acts the bits of `base`."""
     points, base, shiny = sampled.points, sampled.base, sampled.shiny
     edited = base.copy()
@@ -112,7 +112,9 @@ def under_stack(g: Gatherer, records: EditedRecords, sampled: Sampled) -> F32:
     # Curves, light from behind occluders, and mixtures of too many soft masks look at pairs of their own; the
     # cache corrects what their few rays brought.
     has_records = sampled.found.number[where] > 0
-    by_pairs = has_records & (soft_masks(receivers.columns) > MOST_SOFT)[receivers.which]
+    by_pairs = np.zeros(len(where), np.bool_)
+    if not records.takes_soft_masks:
+        by_pairs = has_records & (soft_masks(receivers.columns) > MOST_SOFT)[receivers.which]
     if g.field.aggregates or g.field.throughs:
         by_pairs[:] = True
     lobes = [] if shiny is None else [shiny]
@@ -169,13 +171,13 @@ class CachedParts:
         cells = np.concatenate(sent, axis=1)
         self._cells = np.concatenate([cells, np.zeros((1, cells.shape[1]), np.float32)])
         self._values = light_of_records(cache, self._cells)
-        self._records: list[EditedRecords | None] = [None for _ in parts]
+        self._records: list[MaskedRecords | EditedRecords | None] = [None for _ in parts]
 
     def take_edits(self, hemispheres: Hemispheres) -> None:
         """Edit the light of the parts, too."""
         for number, part in enumerate(self._parts):
             if not part.field.is_identity:
-                self._records[number] = EditedRecords(part, self._cache, hemispheres)
+                self._records[number] = edited_records(part, self._cache, hemispheres)
 
     def light(self, sampled: Sampled, whole: F32) -> tuple[tuple[F32, F32], ...]:
         """Radiance towards the eye, without edits and with them, of each part; `whole` is the edited light of all."""

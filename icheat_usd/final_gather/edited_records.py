@@ -11,11 +11,12 @@ import numpy as np
 
 from icheat_usd.edits.bound import Ends, weighted
 from icheat_usd.edits.field import EditField
+from icheat_usd.edits.mask_stack import is_of_masks
 from icheat_usd.edits.operations import PairEnd
-from icheat_usd.final_gather.caster_light import CasterKeys, CasterLight, caster_keys, is_of_masks
 from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, RecordValues
+from icheat_usd.final_gather.masked_records import MaskedRecords
 from icheat_usd.final_gather.receiver_sets import Mixtures, Touched, mixtures
 from icheat_usd.final_gather.record_rays import RecordRays, take_rays
 from icheat_usd.kernels import record_mixtures as kernels
@@ -23,6 +24,14 @@ from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
 
 _STEP = 0.1  # of a record's reach, or radians: from how far beside a record a receiver's own part is looked at
+
+
+def edited_records(
+    gatherer: Gatherer, cache: IrradianceCache, hemispheres: Hemispheres
+) -> MaskedRecords | EditedRecords:
+    """Changes that a gatherer's stack makes of the light of a cache's records."""
+    is_summed = is_of_masks(gatherer.field)
+    return (MaskedRecords if is_summed else EditedRecords)(gatherer, cache, hemispheres)
 
 
 class EditedRecords:
@@ -34,15 +43,12 @@ class EditedRecords:
         Rays of the cache's records.
     """
 
+    #: Mixtures are of no more than `MOST_SOFT` masks.
+    takes_soft_masks = False
+
     def __init__(self, gatherer: Gatherer, cache: IrradianceCache, hemispheres: Hemispheres) -> None:
         assert gatherer.solution is not None
         self._gatherer, self._cache, self._hemispheres = gatherer, cache, hemispheres
-        self._sums = CasterLight(gatherer.snapshot.geometry, gatherer.solution)
-        self._is_summed = is_of_masks(gatherer.field)
-        self._keys: dict[bytes, CasterKeys | None] = {}
-        self._every: CasterKeys | None = None
-        if self._is_summed:
-            self._every = caster_keys(gatherer.field, np.ones(gatherer.field.n_rows, np.bool_))
         self._slots: dict[bytes, I32] = {}
         self._values = _no_values(0)
 
@@ -76,48 +82,22 @@ class EditedRecords:
             *found[:3],
             where,
             which,
-            *mixed[2:],
+            *mixed[1:],
             out,
         )
         return out
 
     def change_alone(self, points: SurfacePoints, rays: Hemispheres, row: I64, receivers: Touched) -> F32:
         """The same at m receivers without records, from hemispheres of their own; `row` (m,) is that of each."""
-        mixed = _mixtures_of(receivers)
-        keys = [self._keys_of(active) for active in mixed.active]
-        if not self._is_summed or any(one is None for one in keys):
-            own = rays.parts[0].rays
-            pairs = RecordPairs(self._gatherer, take_rays(own, row), take_points(points, receivers.where))
-            return np.asarray(np.pi * pairs.change(np.arange(len(row)), receivers.ends().masks).mean(axis=1))
-        out = np.zeros((len(row), 3), np.float32)
-        number = np.diff(mixed.begin)[receivers.which]
-        owner = np.repeat(np.arange(len(row)), number)
-        nth = np.arange(len(owner)) - (np.cumsum(number) - number)[owner]
-        entry = mixed.begin[receivers.which][owner] + nth
-        for one, (is_in, key) in enumerate(zip(mixed.is_in, keys, strict=True)):
-            mine = np.flatnonzero(mixed.entry[entry] == one)
-            needed = np.zeros(rays.n, np.bool_)
-            needed[row[owner[mine]]] = True
-            assert key is not None
-            light = self._sums.change(rays, self._gatherer.field, key, is_in, needed)
-            place = (np.cumsum(needed) - 1)[row[owner[mine]]]
-            out[owner[mine]] += mixed.weight[entry[mine]][:, None] * light.irradiance[place]
-        return out
-
-    def _keys_of(self, active: Bool) -> CasterKeys | None:
-        """What tells the light apart for receivers in some edits; None if no sums do."""
-        if self._every is not None or not self._is_summed:
-            return self._every
-        name = active.tobytes()
-        if name not in self._keys:
-            self._keys[name] = caster_keys(self._gatherer.field, active)
-        return self._keys[name]
+        own = rays.parts[0].rays
+        pairs = RecordPairs(self._gatherer, take_rays(own, row), take_points(points, receivers.where))
+        return np.asarray(np.pi * pairs.change(np.arange(len(row)), receivers.ends().masks).mean(axis=1))
 
     def _prepare(self, mixed: Mixtures, wanted: Bool) -> None:
         """Changes of records in some sets of edits; `wanted` is (n_sets, n_records)."""
         n = len(self._values.irradiance)
         parts, missing = [self._values], []
-        for is_in, active, asked in zip(mixed.is_in, mixed.active, wanted, strict=True):
+        for is_in, asked in zip(mixed.is_in, wanted, strict=True):
             slots = self._slots.setdefault(is_in.tobytes(), np.full(self._cache.n, -1, np.int32))
             needed = asked & (slots < 0)
             count = int(needed.sum())
@@ -125,10 +105,6 @@ class EditedRecords:
                 continue
             slots[needed] = n + np.arange(count, dtype=np.int32)
             n += count
-            keys = self._keys_of(active)
-            if keys is not None:
-                parts.append(self._sums.change(self._hemispheres, self._gatherer.field, keys, is_in, needed))
-                continue
             parts.append(_no_values(count))
             missing.append((is_in, needed, parts[-1]))
         if missing:

@@ -13,7 +13,7 @@ from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
 
 if TYPE_CHECKING:
-    from icheat_usd.final_gather.caster_light import LightByKey
+    from icheat_usd.final_gather.caster_light import LightByCaster
 
 _RAYS_AT_ONCE = 1 << 19
 
@@ -32,7 +32,7 @@ class Hemispheres:
 
     parts: list[Part]
     shrink: F32  #: (n,) factor on what changes with place
-    light: list[LightByKey] = field(default_factory=list)
+    light: list[LightByCaster] = field(default_factory=list)
     _shares: F32 | None = None
 
     @property

@@ -226,7 +226,7 @@ def _cached(
         total = gatherer.solution.total
         near = NearLight(snapshot, gatherer.tracer, gatherer.sampler, gather, total, n_paths, own_seed)
     tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed, near)
-    keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.is_identity
+    keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.acts_on_views_alone
     cache = IrradianceCache(tracer, cells, settings.cache, is_kept=keeps_rays)
     found, pixel = [], []
     for band in camera.first():

@@ -41,17 +41,18 @@ class Touched(NamedTuple):
 
 def touched(field: EditField, points: SurfacePoints) -> Touched:
     """The points of some that an edit may change."""
-    selections = [receivers for bound in field.edits for receivers in bound.receivers]
-    is_plain = not field.uses_receiver and all(
-        rows is None and receivers.constant_on_instances
-        for bound in field.edits
-        for receivers, rows in zip(bound.receivers, bound.rows, strict=True)
-    )
-    if not is_plain:
+    if field.uses_receiver:
         everyone = field.receivers(points)
         where = np.flatnonzero((everyone.masks > 0).any(axis=0))
         some = everyone.take(where)
         return Touched(field, where, some.masks, np.arange(len(where)), some)
+    selections = [receivers for bound in field.edits for receivers in bound.receivers]
+    if not all(receivers.constant_on_instances for receivers in selections):
+        masks = field.receiver_masks(points).T
+        where = np.flatnonzero((masks > 0).any(axis=1))
+        return Touched(
+            field, where, (masks if len(where) == len(masks) else masks[where]).T, np.arange(len(where)), None
+        )
     on_instances = np.stack([selection.on_instances for selection in selections]).astype(np.float32)
     columns, of_instance = np.unique(on_instances, axis=1, return_inverse=True)
     acts: Bool = np.asarray((columns > 0).any(axis=0), np.bool_)
@@ -65,7 +66,6 @@ class Mixtures(NamedTuple):
     """Sets of edits that columns of masks are mixed from: entries ``begin[i]:begin[i + 1]`` of column i."""
 
     is_in: list[Bool]  #: of each set, (n_rows,)
-    active: list[Bool]  #: edits of the receivers that first asked for it
     begin: I64  #: (k + 1,)
     entry: I32  #: (n_entries,) set
     weight: F32  #: (n_entries,)
@@ -79,12 +79,11 @@ def mixtures(columns: F32, wanted: Bool) -> Mixtures:
     chosen = np.flatnonzero(wanted)
     masks = columns[:, chosen]
     hard, soft = masks >= 1, (masks > 0) & (masks < 1)
-    first, which = _patterns(np.packbits(np.concatenate([hard, soft]), axis=0))
+    first, which = patterns(np.packbits(np.concatenate([hard, soft]), axis=0))
     order = np.argsort(which, kind="stable")
     begin = np.searchsorted(which[order], np.arange(len(first) + 1))
     number: dict[bytes, int] = {}
     is_in: list[Bool] = []
-    active: list[Bool] = []
     owner, entry, weight = [np.zeros(0, np.int64)], [np.zeros(0, np.int32)], [np.zeros(0, np.float32)]
     for pattern, example in enumerate(first.tolist()):
         places = order[begin[pattern] : begin[pattern + 1]]
@@ -100,7 +99,6 @@ def mixtures(columns: F32, wanted: Bool) -> Mixtures:
             one = number.setdefault(inside.tobytes(), len(is_in))
             if one == len(is_in):
                 is_in.append(inside)
-                active.append(hard[:, example] | soft[:, example])
             owner.append(chosen[places])
             entry.append(np.full(len(places), one, np.int32))
             weight.append(share)
@@ -108,7 +106,6 @@ def mixtures(columns: F32, wanted: Bool) -> Mixtures:
     order = np.argsort(column, kind="stable")
     return Mixtures(
         is_in,
-        active,
         np.searchsorted(column[order], np.arange(columns.shape[1] + 1)),
         np.concatenate(entry)[order],
         np.concatenate(weight)[order],
@@ -121,7 +118,7 @@ def soft_masks(masks: F32) -> I64:
     return found
 
 
-def _patterns(columns: U8) -> tuple[I64, I64]:
+def patterns(columns: U8) -> tuple[I64, I64]:
     """Different columns of (k, m) bytes: the first place of each, and which one every place has.
 
     ``np.unique(columns, axis=1)``, which sorts whole columns, took a quarter of a frame with 64 edits.

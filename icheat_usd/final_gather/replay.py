@@ -10,7 +10,7 @@ import numpy as np
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.final_gather.cached import CachedGather, under_stack
-from icheat_usd.final_gather.edited_records import EditedRecords
+from icheat_usd.final_gather.edited_records import edited_records
 from icheat_usd.final_gather.gatherer import Gatherer, GatherSolution
 from icheat_usd.samples import ViewSamples
 from icheat_usd.samples.develop import develop
@@ -53,7 +53,7 @@ class Replay:
         """
         gatherer = self._under(field)
         cache = self._cached.cache
-        records = None if field.is_identity else EditedRecords(gatherer, cache, self._cached.hemispheres)
+        records = None if field.is_identity else edited_records(gatherer, cache, self._cached.hemispheres)
         parts = []
         for (pixels, view), sampled in zip(self._bands, self._cached.samples, strict=True):
             light = sampled.base if records is None else under_stack(gatherer, records, sampled)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.edits.model import Edit, KeyedPayload, Payload
-from icheat_usd.final_gather import GatherSettings, final_gather
+from icheat_usd.final_gather import GatherSettings, final_gather, masked_records
 from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, WHITE, painted, previews, soft
 from tests.pipeline import TINY, select
 
@@ -40,6 +40,10 @@ STACKS = {
 }
 
 
+#: Stacks that look at nothing but masks, and have few soft ones that overlap.
+OF_MASKS = ("objects", "overlapping", "added light", "soft masks", "painted casters", "painted casters and objects")
+
+
 def rendered(*edits: Edit, is_kept: bool = False):
     parts = previews()[0]
     return final_gather(
@@ -70,16 +74,16 @@ def test_a_render_that_is_not_kept_has_no_replay():
     assert rendered(BLEED).replay is None
 
 
-@pytest.mark.parametrize(
-    "name", ["objects", "overlapping", "added light", "soft masks", "painted casters", "painted casters and objects"]
-)
-def test_light_by_caster_is_the_light_of_the_rays(name, monkeypatch):
-    """Summed for each caster first, and edited ray by ray."""
+@pytest.mark.parametrize("name", OF_MASKS)
+@pytest.mark.parametrize("change, tolerance", [(0.0, 2e-4), (masked_records.MOST_CHANGE, 5e-3)])
+def test_light_under_masks_is_the_light_of_the_rays(name, change, tolerance, monkeypatch):
+    """With masks for every place, and with those of places near it; and edited ray by ray."""
+    monkeypatch.setattr(masked_records, "MOST_CHANGE", change)
     fast = rendered(*STACKS[name]).indirect_edited
     monkeypatch.setattr("icheat_usd.final_gather.edited_records.is_of_masks", lambda field: False)
     slow = rendered(*STACKS[name]).indirect_edited
     assert (fast != slow).any()
-    np.testing.assert_allclose(fast, slow, rtol=2e-4, atol=1e-6)
+    np.testing.assert_allclose(fast, slow, rtol=tolerance, atol=1e-6)
 
 
 def test_a_replay_has_the_same_bits_on_one_thread_and_on_two():

@@ -1,0 +1,313 @@
+"""Slots: masks of receivers that the edited light of a cache record is found for, and light at places from these.
+
+Places whose masks are near those of a slot share it: the light there is that of the slot plus its derivatives by the
+masks that differ. Whatever one mask makes of light is a straight line; what two of them make together bends it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.caster_sums import N_VALUES
+from icheat_usd.kernels.simd import address_of, color_of, load_color, scale_add, store_rgb
+
+#: New slots of one record from one call, beyond which places take the nearest.
+MOST_SLOTS = 32
+
+
+@kernel
+def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-untyped-def]
+    """Pairs of m places and their records, by record; places of one record stay in order.
+
+    Parameters
+    ----------
+    count : (n,) int32, record : (n, MAX_ENTRIES) int32
+        As of `irradiance_cache.find_records`.
+    where : (m,) int64
+        Places that are looked at.
+    begin : (n_records + 1,) int64, out
+        Pairs of each record.
+    pair : (n_pairs,) int64, out
+        Number of each among the pairs in the order of places.
+    place : (n_pairs,) int64, out
+        Which of `where` it is of.
+    """
+    begin[:] = 0
+    for q in range(len(where)):
+        for k in range(count[where[q]]):
+            begin[record[where[q], k] + 1] += 1
+    for r in range(len(begin) - 1):
+        begin[r + 1] += begin[r]
+    n = 0
+    for q in range(len(where)):
+        for k in range(count[where[q]]):
+            r = record[where[q], k]
+            e = begin[r]
+            pair[e], place[e] = n, q
+            begin[r] += 1
+            n += 1
+    for r in range(len(begin) - 1, 0, -1):
+        begin[r] = begin[r - 1]
+    begin[0] = 0
+
+
+@kernel
+def _difference(a, i, b, j, soft, bend, most_bend):  # type: ignore[no-untyped-def]
+    """How differently two rows of masks act: sum of relative changes, and what each two of them make together."""
+    total, squares = np.float32(0.0), np.float32(0.0)
+    for row in soft:
+        own = abs(a[i, row] - b[j, row]) * bend[row]
+        total += own
+        squares += own * own
+        if total > most_bend:
+            break
+    return total, np.float32(0.5) * (total * total - squares)
+
+
+@parallel_kernel
+def choose_slots(  # type: ignore[no-untyped-def]
+    begin,
+    place,
+    which,
+    masks,
+    pattern,
+    own_masks,
+    own_pattern,
+    known_begin,
+    known_slot,
+    slot_masks,
+    slot_pattern,
+    soft,
+    bend,
+    most_change,
+    most_bend,
+    centre,
+    is_own,
+):
+    """Slots that pairs of places and records are served by.
+
+    Parameters
+    ----------
+    begin, place : as of `list_pairs`
+    which : (m,) int64
+        Column of masks of each place.
+    masks : (k, n_rows) float32, pattern : (k,) int32
+        Columns; those of different patterns never share a slot.
+    own_masks : (n_records, n_rows) float32, own_pattern : (n_records,) int32
+        Of the records' own places, which make the first slot where they serve.
+    known_begin : (n_records + 1,) int64, known_slot : (n_slots,) int64
+        Slots that there are already, by record.
+    slot_masks : (n_slots, n_rows) float32, slot_pattern : (n_slots,) int32
+    soft : (n_soft,) int64
+        Rows whose masks vary from place to place.
+    bend : (n_rows,) float32
+        Largest relative change of light by each row.
+    most_change, most_bend : float
+        Limits of the relative change between a place and its slot, and of what it misses of it.
+    centre : (n_pairs,) int64, out
+        Pair whose slot serves each, itself where it gets a new one; ``-1 - s`` for a known slot s.
+    is_own : (n_pairs,) uint8, out
+        1 where a new slot has the masks of the record's own place, not those of the pair's.
+    """
+    for r in prange(len(begin) - 1):
+        if begin[r] < begin[r + 1]:
+            _choose(
+                r,
+                begin,
+                place,
+                which,
+                masks,
+                pattern,
+                own_masks,
+                own_pattern,
+                known_begin,
+                known_slot,
+                slot_masks,
+                slot_pattern,
+                soft,
+                bend,
+                most_change,
+                most_bend,
+                centre,
+                is_own,
+            )
+
+
+@kernel
+def _choose(  # type: ignore[no-untyped-def]
+    r,
+    begin,
+    place,
+    which,
+    masks,
+    pattern,
+    own_masks,
+    own_pattern,
+    known_begin,
+    known_slot,
+    slot_masks,
+    slot_pattern,
+    soft,
+    bend,
+    most_change,
+    most_bend,
+    centre,
+    is_own,
+):
+    new, n_new = np.empty(MOST_SLOTS, np.int64), 0
+    for e in range(begin[r], begin[r + 1]):
+        column = which[place[e]]
+        is_own[e] = 0
+        best, least = np.int64(e), np.float32(np.inf)
+        is_near = False
+        for k in range(known_begin[r], known_begin[r + 1]):
+            s = known_slot[k]
+            if slot_pattern[s] != pattern[column]:
+                continue
+            change, bent = _difference(masks, column, slot_masks, s, soft, bend, most_change)
+            if change < least:
+                best, least = -1 - s, change
+                is_near = change <= most_change and bent <= most_bend
+                if is_near:
+                    break
+        q = 0
+        while q < n_new and not is_near:
+            other = new[q]
+            q += 1
+            if is_own[other]:
+                if own_pattern[r] != pattern[column]:
+                    continue
+                change, bent = _difference(masks, column, own_masks, r, soft, bend, most_change)
+            else:
+                there = which[place[other]]
+                if pattern[there] != pattern[column]:
+                    continue
+                change, bent = _difference(masks, column, masks, there, soft, bend, most_change)
+            if change < least:
+                best, least = other, change
+                is_near = change <= most_change and bent <= most_bend
+        if not is_near and (n_new < MOST_SLOTS or best == e):
+            best = np.int64(e)
+            if own_pattern[r] == pattern[column]:
+                change, bent = _difference(masks, column, own_masks, r, soft, bend, most_change)
+                if change <= most_change and bent <= most_bend:
+                    is_own[e] = 1
+            if n_new < MOST_SLOTS:
+                new[n_new] = e
+                n_new += 1
+        centre[e] = best
+
+
+@parallel_kernel
+def mix_slots(  # type: ignore[no-untyped-def]
+    at,
+    facing,
+    values,
+    derivative,
+    derived,
+    slot_masks,
+    slot_pattern,
+    soft_begin,
+    soft_row,
+    slot,
+    position,
+    normal,
+    count,
+    record,
+    weight,
+    where,
+    which,
+    masks,
+    first,
+    out,
+):
+    """`irradiance_cache.interpolate` at m of n places, of each record's light in the slot for the place.
+
+    Parameters
+    ----------
+    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, 4) float32
+    derived : (n_slots + 1,) int64
+        Derivatives of each slot, by the rows ``soft_row[soft_begin[p]:soft_begin[p + 1]]`` of its pattern p.
+    slot : (n_pairs,) int64
+        Slot of each pair of a place and a record.
+    masks : (k, n_rows) float32
+    first : (m,) int64
+        First pair of each place.
+    out : (m, 3) float32
+    """
+    for q in prange(len(where)):
+        _mix_at(
+            q,
+            where[q],
+            at,
+            facing,
+            values,
+            derivative,
+            derived,
+            slot_masks,
+            slot_pattern,
+            soft_begin,
+            soft_row,
+            slot,
+            position,
+            normal,
+            count,
+            record,
+            weight,
+            which[q],
+            masks,
+            first[q],
+            out,
+        )
+
+
+@kernel
+def _mix_at(  # type: ignore[no-untyped-def]
+    q,
+    p,
+    at,
+    facing,
+    values,
+    derivative,
+    derived,
+    slot_masks,
+    slot_pattern,
+    soft_begin,
+    soft_row,
+    slot,
+    position,
+    normal,
+    count,
+    record,
+    weight,
+    column,
+    masks,
+    first,
+    out,
+):
+    values_0, derivative_0 = address_of(values), address_of(derivative)
+    zero = np.float32(0.0)
+    total = color_of(zero, zero, zero)
+    nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
+    for k in range(count[p]):
+        r, s, w = record[p, k], slot[first + k], weight[p, k]
+        dx, dy, dz = position[p, 0] - at[r, 0], position[p, 1] - at[r, 1], position[p, 2] - at[r, 2]
+        mx, my, mz = facing[r, 0], facing[r, 1], facing[r, 2]
+        own = values_0 + 16 * N_VALUES * s
+        total = scale_add(load_color(own), w, total)
+        total = scale_add(load_color(own + 16), w * (my * nz - mz * ny), total)
+        total = scale_add(load_color(own + 32), w * (mz * nx - mx * nz), total)
+        total = scale_add(load_color(own + 48), w * (mx * ny - my * nx), total)
+        total = scale_add(load_color(own + 64), w * dx, total)
+        total = scale_add(load_color(own + 80), w * dy, total)
+        total = scale_add(load_color(own + 96), w * dz, total)
+        if derived[s] < derived[s + 1]:
+            pattern = slot_pattern[s]
+            for e in range(soft_begin[pattern], soft_begin[pattern + 1]):
+                row = soft_row[e]
+                step = w * (masks[column, row] - slot_masks[s, row])
+                to = derivative_0 + 16 * (derived[s] + e - soft_begin[pattern])
+                total = scale_add(load_color(to), step, total)
+    store_rgb(address_of(out) + 12 * q, total)
