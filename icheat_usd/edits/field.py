@@ -231,19 +231,25 @@ class EditField:
         Light of some lights alone, `is_part`, is scaled and no more: what is added is of no light, and only the sum
         of all lights is clamped.
         """
+        lines = self.view_lines(receivers.masks)
+        return self.seen(light, lines, is_part=is_part)
+
+    def view_lines(self, masks: F32) -> tuple[F32, F32] | None:
+        """Scale and offset, (n, 3) each, of all that acts on views, at masks (n_rows, n) of receivers; None if none."""
         row = 0
+        shape = (masks.shape[1], 3)
         scale: F32 | None = None
-        offset: F32 = np.zeros_like(light)
+        offset: F32 = np.zeros(shape, np.float32)
         for bound in self.edits:
             rows = range(row, row + bound.n_keys)
             row += bound.n_keys
             if bound.level is not Level.VIEW:
                 continue
-            scale = np.ones_like(light) if scale is None else scale
-            delta, added = np.zeros_like(light), np.zeros_like(light)
-            kept = np.zeros((len(light), 1), np.float32)
+            scale = np.ones(shape, np.float32) if scale is None else scale
+            delta, added = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+            kept = np.zeros((len(delta), 1), np.float32)
             for key, mask_row in enumerate(rows):
-                weight = (np.float32(bound.edit.amount * bound.key_weights[key]) * receivers.masks[mask_row])[:, None]
+                weight = (np.float32(bound.edit.amount * bound.key_weights[key]) * masks[mask_row])[:, None]
                 s, o = bound.view(key)
                 kept, delta, added = kept + weight, delta + weight * (s - ONE), added + weight * o
             carries = {Blend.COMPOSE: ONE + delta, Blend.OVER: ONE - kept, Blend.ADD: np.ones_like(kept)}
@@ -252,10 +258,15 @@ class EditField:
             if bound.edit.blend is not Blend.COMPOSE:
                 scale = scale + (kept * (bound.edit.blend is Blend.OVER) + delta)
             offset = carried * offset + added
+        return None if scale is None else (scale, offset)
+
+    @staticmethod
+    def seen(light: F32, lines: tuple[F32, F32] | None, *, is_part: bool = False) -> F32:
+        """`finish` where `view_lines` of the receivers are known."""
         if is_part:
-            return light if scale is None else scale * light
+            return light if lines is None else lines[0] * light
         # Once, at the end: a weaker edit's negative light may be lifted by a stronger one.
-        return np.maximum(light if scale is None else scale * light + offset, np.float32(0))
+        return np.maximum(light if lines is None else lines[0] * light + lines[1], np.float32(0))
 
 
 def _ends(masks: list[F32], located: list[Any], points: SurfacePoints, with_place: bool) -> Ends:

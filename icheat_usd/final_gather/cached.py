@@ -145,7 +145,7 @@ def under_stack(g: Gatherer, records: MaskedRecords | EditedRecords, sampled: Sa
             light[rest] += reflected - _brought(len(base), lobes)[at]
         if g.solution is not None and g.solution.offsets is not None:
             light[rest] += offset_radiance(g.field, g.solution.offsets, some.ends(), albedo)
-    edited[where] = g.field.finish(light, receivers.ends(), is_part=g.is_part)
+    edited[where] = g.field.seen(light, receivers.view_lines(), is_part=g.is_part)
     return edited
 
 

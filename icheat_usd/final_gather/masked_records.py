@@ -58,15 +58,16 @@ class MaskedRecords:
         self._field, self._cache, self._hemispheres = gatherer.field, cache, hemispheres
         self._geometry = gatherer.snapshot.geometry
         self._stack = mask_stack(self._field, with_emission=gatherer.solution.sent is None)
-        self._bend = bends(self._stack)
+        bend = bends(self._stack)
         with_transport = len(self._stack.start) > self._field.n_groups
         self._sent = sent_by_group(gatherer.solution, with_transport=with_transport)
         table = mask_table(_acting(self._field), gatherer.snapshot.n_instances)
         assert table is not None
         self._casters = table
         self._by_rays = bool((table.mask >= 0).any())
-        self._soft = np.flatnonzero(_vary(self._field) & (self._bend > 0))
-        self._patterns = _Patterns(self._soft, self._bend > 0)
+        is_soft = _vary(self._field) & (bend > 0)
+        self._bend = np.where(is_soft, bend, np.float32(0))
+        self._patterns = _Patterns(is_soft, bend > 0)
         self._own: tuple[F32, I32] | None = None
         n_rows = self._field.n_rows
         self._slots = _Slots(
@@ -91,7 +92,7 @@ class MaskedRecords:
         """
         cache, where, which = self._cache, receivers.where, receivers.which
         out = np.zeros((len(where), 3), np.float32)
-        if not self._bend.any():
+        if not self._patterns.acts.any():
             return out
         masks = np.ascontiguousarray(receivers.columns.T)
         slot = self._choose(found, where, which, masks)
@@ -121,7 +122,7 @@ class MaskedRecords:
 
     def change_alone(self, points: SurfacePoints, rays: Hemispheres, row: I64, receivers: Touched) -> F32:
         """The same at m receivers without records, from hemispheres of their own; `row` (m,), ascending."""
-        masks = np.ascontiguousarray(np.take(receivers.columns, receivers.which, axis=1).T)
+        masks = np.take(np.ascontiguousarray(receivers.columns.T), receivers.which, axis=0)
         n = len(row)
         nowhere = np.full((1, self._field.n_rows), -1, np.int16)
         begin = np.searchsorted(row, np.arange(rays.n + 1))
@@ -153,7 +154,6 @@ class MaskedRecords:
             known,
             slots.masks,
             slots.pattern,
-            self._soft,
             self._bend,
             MOST_CHANGE,
             MOST_BEND,
@@ -176,7 +176,7 @@ class MaskedRecords:
         if self._own is None:
             parts = self._hemispheres.parts
             n, n_rows = self._cache.n, self._field.n_rows
-            if len(self._soft) == 0:  # Nobody looks at them.
+            if not self._bend.any():  # Nobody looks at them.
                 self._own = np.zeros((n, n_rows), np.float32), np.full(n, -1, np.int32)
             else:
                 owner = np.concatenate([part.owner for part in parts])
@@ -264,22 +264,20 @@ class _Patterns:
 
     Parameters
     ----------
-    soft : (n_soft,)
+    is_soft : (n_rows,)
         Rows whose masks vary from place to place.
     acts : (n_rows,)
         Rows that change light.
     """
 
-    def __init__(self, soft: I64, acts: Bool) -> None:
-        self._is_soft = np.zeros(len(acts), np.bool_)
-        self._is_soft[soft] = True
-        self._acts = acts
+    def __init__(self, is_soft: Bool, acts: Bool) -> None:
+        self._is_soft, self.acts = is_soft, acts
         self._number: dict[bytes, int] = {}
         self._is_in: list[Bool] = []
 
     def of(self, masks: F32) -> I32:
         """Pattern of each of k columns of masks, (k, n_rows)."""
-        is_in = (masks > 0) & self._acts
+        is_in = (masks > 0) & self.acts
         first, which = patterns(np.packbits(is_in, axis=1).T)
         numbers = []
         for row in first.tolist():

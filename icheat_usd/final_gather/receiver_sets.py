@@ -29,7 +29,12 @@ class Touched(NamedTuple):
 
     def ends(self) -> Ends:
         """All that the stack asks of them."""
-        return self.whole or Ends(np.take(self.columns, self.which, axis=1), None, ())
+        return self.whole or Ends(np.take(self.columns.T, self.which, axis=0).T, None, ())
+
+    def view_lines(self) -> tuple[F32, F32] | None:
+        """`EditField.view_lines` of the points."""
+        found = self.field.view_lines(self.columns)
+        return None if found is None else (np.take(found[0], self.which, axis=0), np.take(found[1], self.which, axis=0))
 
     def take(self, some: I64) -> Touched:
         """Some of them."""

@@ -40,79 +40,55 @@ class RayTable(NamedTuple):
 
 
 @kernel
-def sender_of(rays, r, ray, d):  # type: ignore[no-untyped-def]
-    """Instance that sends light along a ray, -1 for none; `d` is the next detour."""
-    if d < rays.detour_begin[r + 1] and rays.detour[d] == r * rays.cell.shape[1] + ray:
-        return rays.end_instance[d]
-    return rays.instance[r, ray] if rays.cell[r, ray] >= 0 else np.int32(-1)
-
-
-class Strata(NamedTuple):
-    """What rays of one hemisphere count in its irradiance and gradients, by ring and by sector."""
-
-    slope: NDArray[np.float64]  #: (n_theta,)
-    low: NDArray[np.float64]
-    width: NDArray[np.float64]
-    across: NDArray[np.float64]  #: (n_phi,)
-    along: NDArray[np.float64]
-    edge_across: NDArray[np.float64]  #: (n_phi + 1,)
-    edge_along: NDArray[np.float64]
-    share: float
-
-
-@kernel
-def strata_of(first_turn, n_theta, n_phi, factor):  # type: ignore[no-untyped-def]
-    """Strata of a hemisphere whose first azimuth is at `first_turn`; all of it times `factor`."""
-    m, n = n_theta, n_phi
-    share = np.pi / (m * n) * factor
-    slope, low, width = np.empty(m), np.empty(m), np.empty(m)
-    for j in range(m):
-        u = (j + 0.5) / m
-        slope[j] = share * np.sqrt(u / (1.0 - u))
-        low[j] = factor * (1.0 - j / m) * np.sqrt(j / m) * (2.0 * np.pi / n)
-        width[j] = factor * (np.sqrt((j + 1) / m) - np.sqrt(j / m))
-    across, along = np.empty(n), np.empty(n)
-    edge_across, edge_along = np.empty(n + 1), np.empty(n + 1)
-    for k in range(n):
-        phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
-        edge = 2.0 * np.pi * (k / n + first_turn)
-        across[k], along[k] = np.cos(phi), np.sin(phi)
-        edge_across[k], edge_along[k] = np.cos(edge), np.sin(edge)
-    edge_across[n], edge_along[n] = edge_across[0], edge_along[0]
-    return Strata(slope, low, width, across, along, edge_across, edge_along, share)
-
-
-@kernel
-def ray_weights(strata, distance, r, j, k):  # type: ignore[no-untyped-def]
-    """How much ray (j, k) counts: in the gradient with turns, and with place, along both tangents each.
+def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: ignore[no-untyped-def]
+    """How much each ray of hemisphere `r` counts: in its gradient with turns, and with place, along both tangents each.
 
     A ray counts in the differences to the four beside it, with one sign or the other (`record_sums`).
+
+    Parameters
+    ----------
+    first_turn : float
+        Where the first azimuth lies.
+    factor : float
+        On the hemisphere.
+    out : (n_rays, 4) float32, out
     """
-    m, n = len(strata.slope), len(strata.across)
-    ray = j * n + k
-    far = distance[r, ray]
-    before, after = (k - 1 if k > 0 else n - 1), (k + 1 if k + 1 < n else 0)
-    out = 0.0
-    if j > 0:
-        out += strata.low[j] / max(min(far, distance[r, ray - n]), _TOUCHING)
-    if j + 1 < m:
-        out -= strata.low[j + 1] / max(min(far, distance[r, ray + n]), _TOUCHING)
-    here = strata.width[j] / max(min(far, distance[r, j * n + before]), _TOUCHING)
-    there = strata.width[j] / max(min(far, distance[r, j * n + after]), _TOUCHING)
-    a = strata.across[k] * out - strata.edge_along[k] * here + strata.edge_along[k + 1] * there
-    b = strata.along[k] * out + strata.edge_across[k] * here - strata.edge_across[k + 1] * there
-    ga, gb = -strata.along[k] * strata.slope[j], strata.across[k] * strata.slope[j]
-    return np.float32(ga), np.float32(gb), np.float32(a), np.float32(b)
+    m, n = n_theta, n_phi
+    close = np.empty(m * n, np.float32)
+    for ray in range(m * n):
+        close[ray] = np.float32(1.0) / max(distance[r, ray], _TOUCHING)
+    for k in range(n):
+        phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
+        edge, next_edge = 2.0 * np.pi * (k / n + first_turn), 2.0 * np.pi * ((k + 1) / n + first_turn)
+        across, along = np.cos(phi), np.sin(phi)
+        edge_across, edge_along = np.cos(edge), np.sin(edge)
+        next_across, next_along = np.cos(next_edge), np.sin(next_edge)
+        before, after = (k - 1 if k > 0 else n - 1), (k + 1 if k + 1 < n else 0)
+        for j in range(m):
+            ray, u = j * n + k, (j + 0.5) / m
+            slope = np.pi / (m * n) * factor * np.sqrt(u / (1.0 - u))
+            width = factor * (np.sqrt((j + 1) / m) - np.sqrt(j / m))
+            step = 0.0
+            if j > 0:
+                step += (1.0 - j / m) * np.sqrt(j / m) * max(close[ray], close[ray - n])
+            if j + 1 < m:
+                step -= (1.0 - (j + 1) / m) * np.sqrt((j + 1) / m) * max(close[ray], close[ray + n])
+            step *= factor * (2.0 * np.pi / n)
+            here = width * max(close[ray], close[j * n + before])
+            there = width * max(close[ray], close[j * n + after])
+            out[ray, 0], out[ray, 1] = -along * slope, across * slope
+            out[ray, 2] = across * step - edge_along * here + next_along * there
+            out[ray, 3] = along * step + edge_across * here - next_across * there
 
 
 @kernel
-def add_weighted(to, light, share, ga, gb, a, b):  # type: ignore[no-untyped-def]
+def add_weighted(to, light, share, weights, ray):  # type: ignore[no-untyped-def]
     """Add a ray's light to five sums at an address: as it is, and times its `ray_weights`."""
     store_color(to, scale_add(light, share, load_color(to)))
-    store_color(to + 16, scale_add(light, ga, load_color(to + 16)))
-    store_color(to + 32, scale_add(light, gb, load_color(to + 32)))
-    store_color(to + 48, scale_add(light, a, load_color(to + 48)))
-    store_color(to + 64, scale_add(light, b, load_color(to + 64)))
+    store_color(to + 16, scale_add(light, weights[ray, 0], load_color(to + 16)))
+    store_color(to + 32, scale_add(light, weights[ray, 1], load_color(to + 32)))
+    store_color(to + 48, scale_add(light, weights[ray, 2], load_color(to + 48)))
+    store_color(to + 64, scale_add(light, weights[ray, 3], load_color(to + 64)))
 
 
 @kernel
@@ -150,15 +126,17 @@ def list_casters(rays, selected, wanted, local, number, listed):  # type: ignore
 
 @kernel
 def _list_row(r, rays, selected, local, number, listed):  # type: ignore[no-untyped-def]
-    n, last, place = 0, -1, -1
-    n_rays = rays.cell.shape[1]
-    d = rays.detour_begin[r]
+    cell, instance, detour, end_instance = rays.cell, rays.instance, rays.detour, rays.end_instance
+    n, last, place = 0, np.int32(-1), -1
+    n_rays = cell.shape[1]
+    d, d_end = rays.detour_begin[r], rays.detour_begin[r + 1]
     for ray in range(n_rays):
-        i = sender_of(rays, r, ray, d)
-        if d < rays.detour_begin[r + 1] and rays.detour[d] == r * n_rays + ray:
+        i = instance[r, ray] if cell[r, ray] >= 0 else np.int32(-1)
+        if d < d_end and detour[d] == r * n_rays + ray:
+            i = end_instance[d]
             d += 1
-        local[r, ray] = -1
         if i < 0 or not selected[i]:
+            local[r, ray] = -1
             continue
         if i != last:
             place = 0
@@ -189,32 +167,32 @@ def caster_sums(rays, sent, local, begin, share, seed, n_theta, n_phi, out):  # 
     """
     for r in prange(len(begin) - 1):
         if begin[r] < begin[r + 1]:
-            own = strata_of(turn_of(hash_combine(seed, rays.stream[r])), n_theta, n_phi, share[r])
-            _sums_of_row(r, rays, sent, local, begin[r], begin[r + 1], own, out)
+            first_turn = turn_of(hash_combine(seed, rays.stream[r]))
+            _sums_of_row(r, rays, sent, local, begin[r], begin[r + 1], share[r], first_turn, n_theta, n_phi, out)
 
 
 @kernel
-def _sums_of_row(r, rays, sent, local, begin, end, strata, out):  # type: ignore[no-untyped-def]
-    n_phi = len(strata.across)
-    n_blocks = sent.shape[1]
+def _sums_of_row(r, rays, sent, local, begin, end, factor, first_turn, n_theta, n_phi, out):  # type: ignore[no-untyped-def]
+    cell, adjusted_ray = rays.cell, rays.adjusted
+    n_rays, n_blocks = cell.shape[1], sent.shape[1]
+    weights = np.empty((n_rays, 4), np.float32)
+    ray_weights(rays.distance, r, first_turn, n_theta, n_phi, factor, weights)
     sums = np.zeros((end - begin, n_blocks, 5, 4), np.float32)
     sums_0, sent_0, throughput_0 = address_of(sums), address_of(sent), address_of(rays.throughput)
-    share = np.float32(strata.share)
+    share = np.float32(np.pi / n_rays * factor)
     adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
-    for j in range(len(strata.slope)):
-        for k in range(n_phi):
-            ray = j * n_phi + k
-            is_adjusted = adjusted < adjusted_end and rays.adjusted[adjusted] == r * rays.cell.shape[1] + ray
+    for ray in range(n_rays):
+        is_adjusted = adjusted < adjusted_end and adjusted_ray[adjusted] == r * n_rays + ray
+        if is_adjusted:
+            adjusted += 1
+        place = np.int64(local[r, ray])
+        if place < 0:
+            continue
+        for block in range(n_blocks):
+            light = load_color(sent_0 + 16 * (np.int64(cell[r, ray]) * n_blocks + block))
             if is_adjusted:
-                adjusted += 1
-            if local[r, ray] < 0:
-                continue
-            ga, gb, a, b = ray_weights(strata, rays.distance, r, j, k)
-            for block in range(n_blocks):
-                light = load_color(sent_0 + 16 * (np.int64(rays.cell[r, ray]) * n_blocks + block))
-                if is_adjusted:
-                    light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
-                add_weighted(sums_0 + 80 * (np.int64(local[r, ray]) * n_blocks + block), light, share, ga, gb, a, b)
+                light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
+            add_weighted(sums_0 + 80 * (place * n_blocks + block), light, share, weights, ray)
     nx, ny, nz = rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2]
     for e in range(end - begin):
         for block in range(n_blocks):

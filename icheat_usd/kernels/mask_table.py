@@ -9,7 +9,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.texels import texel_weight
+from icheat_usd.kernels.texels import corner_texels, texel_weight
 
 
 class MaskTable(NamedTuple):
@@ -23,17 +23,6 @@ class MaskTable(NamedTuple):
     texels: NDArray[np.float32]  #: of all masks
     texel_begin: NDArray[np.int64]  #: (n_masks,)
     resolution: NDArray[np.int64]  #: (n_masks,)
-
-
-@kernel
-def weight_of_entry(table, e, face, s, t):  # type: ignore[no-untyped-def]
-    """Weight of entry `e` at a place (s, t) of a control face."""
-    mask = table.mask[e]
-    if mask < 0:
-        return table.weight[e]
-    size = table.resolution[mask]
-    first = table.texel_begin[mask] + (table.first_face[e] + face) * size * size
-    return table.weight[e] * texel_weight(table.texels, first, size, s, t)
 
 
 @parallel_kernel
@@ -56,5 +45,15 @@ def _weights_of_place(p, table, instance, face, face_uv, out):  # type: ignore[n
     i = instance[p]
     if i < 0:
         return
+    mask, weight, texels, resolution = table.mask, table.weight, table.texels, table.resolution
+    row, first_face, texel_begin = table.row, table.first_face, table.texel_begin
+    own_face, s, t = np.int64(face[p]), face_uv[p, 0], face_uv[p, 1]
+    last, corners = np.int64(1), corner_texels(np.int64(1), s, t)
     for e in range(table.begin[i], table.begin[i + 1]):
-        out[p, table.row[e]] = weight_of_entry(table, e, face[p], face_uv[p, 0], face_uv[p, 1])
+        own = weight[e]
+        if mask[e] >= 0:
+            size = resolution[mask[e]]
+            if size != last:
+                last, corners = size, corner_texels(size, s, t)
+            own *= texel_weight(texels, texel_begin[mask[e]] + (first_face[e] + own_face) * size * size, corners)
+        out[p, row[e]] = own

@@ -11,7 +11,19 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.caster_sums import N_VALUES
-from icheat_usd.kernels.simd import address_of, color_of, load_color, scale_add, store_rgb
+from icheat_usd.kernels.simd import (
+    address_of,
+    black,
+    color_add,
+    color_of,
+    color_product,
+    difference,
+    load_color,
+    plus_size,
+    scale_add,
+    store_color,
+    store_rgb,
+)
 
 #: New slots of one record from one call, beyond which places take the nearest.
 MOST_SLOTS = 32
@@ -54,16 +66,24 @@ def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-unt
 
 
 @kernel
-def _difference(a, i, b, j, soft, bend, most_bend):  # type: ignore[no-untyped-def]
+def _difference(a, i, b, j, bend, sums):  # type: ignore[no-untyped-def]
     """How differently two rows of masks act: sum of relative changes, and what each two of them make together."""
-    total, squares = np.float32(0.0), np.float32(0.0)
-    for row in soft:
+    n = len(bend)
+    a_0, b_0, bend_0 = address_of(a) + 4 * n * i, address_of(b) + 4 * n * j, address_of(bend)
+    total, squares = black(), black()
+    for block in range(n // 4):
+        own = difference(load_color(a_0 + 16 * block), load_color(b_0 + 16 * block))
+        own = color_product(own, load_color(bend_0 + 16 * block))
+        total, squares = plus_size(total, own), color_add(own, own, squares)
+    store_color(address_of(sums), total)
+    store_color(address_of(sums) + 16, squares)
+    change = (sums[0] + sums[1]) + (sums[2] + sums[3])
+    square = (sums[4] + sums[5]) + (sums[6] + sums[7])
+    for row in range(n - n % 4, n):
         own = abs(a[i, row] - b[j, row]) * bend[row]
-        total += own
-        squares += own * own
-        if total > most_bend:
-            break
-    return total, np.float32(0.5) * (total * total - squares)
+        change += own
+        square += own * own
+    return change, np.float32(0.5) * (change * change - square)
 
 
 @parallel_kernel
@@ -79,7 +99,6 @@ def choose_slots(  # type: ignore[no-untyped-def]
     known_slot,
     slot_masks,
     slot_pattern,
-    soft,
     bend,
     most_change,
     most_bend,
@@ -100,10 +119,8 @@ def choose_slots(  # type: ignore[no-untyped-def]
     known_begin : (n_records + 1,) int64, known_slot : (n_slots,) int64
         Slots that there are already, by record.
     slot_masks : (n_slots, n_rows) float32, slot_pattern : (n_slots,) int32
-    soft : (n_soft,) int64
-        Rows whose masks vary from place to place.
     bend : (n_rows,) float32
-        Largest relative change of light by each row.
+        Largest relative change of light by each row, 0 where masks do not vary within a pattern.
     most_change, most_bend : float
         Limits of the relative change between a place and its slot, and of what it misses of it.
     centre : (n_pairs,) int64, out
@@ -126,7 +143,6 @@ def choose_slots(  # type: ignore[no-untyped-def]
                 known_slot,
                 slot_masks,
                 slot_pattern,
-                soft,
                 bend,
                 most_change,
                 most_bend,
@@ -149,7 +165,6 @@ def _choose(  # type: ignore[no-untyped-def]
     known_slot,
     slot_masks,
     slot_pattern,
-    soft,
     bend,
     most_change,
     most_bend,
@@ -157,6 +172,7 @@ def _choose(  # type: ignore[no-untyped-def]
     is_own,
 ):
     new, n_new = np.empty(MOST_SLOTS, np.int64), 0
+    sums = np.empty(8, np.float32)
     for e in range(begin[r], begin[r + 1]):
         column = which[place[e]]
         is_own[e] = 0
@@ -166,7 +182,7 @@ def _choose(  # type: ignore[no-untyped-def]
             s = known_slot[k]
             if slot_pattern[s] != pattern[column]:
                 continue
-            change, bent = _difference(masks, column, slot_masks, s, soft, bend, most_change)
+            change, bent = _difference(masks, column, slot_masks, s, bend, sums)
             if change < least:
                 best, least = -1 - s, change
                 is_near = change <= most_change and bent <= most_bend
@@ -179,19 +195,19 @@ def _choose(  # type: ignore[no-untyped-def]
             if is_own[other]:
                 if own_pattern[r] != pattern[column]:
                     continue
-                change, bent = _difference(masks, column, own_masks, r, soft, bend, most_change)
+                change, bent = _difference(masks, column, own_masks, r, bend, sums)
             else:
                 there = which[place[other]]
                 if pattern[there] != pattern[column]:
                     continue
-                change, bent = _difference(masks, column, masks, there, soft, bend, most_change)
+                change, bent = _difference(masks, column, masks, there, bend, sums)
             if change < least:
                 best, least = other, change
                 is_near = change <= most_change and bent <= most_bend
         if not is_near and (n_new < MOST_SLOTS or best == e):
             best = np.int64(e)
             if own_pattern[r] == pattern[column]:
-                change, bent = _difference(masks, column, own_masks, r, soft, bend, most_change)
+                change, bent = _difference(masks, column, own_masks, r, bend, sums)
                 if change <= most_change and bent <= most_bend:
                     is_own[e] = 1
             if n_new < MOST_SLOTS:

@@ -13,8 +13,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import N_VALUES, add_weighted, ray_weights, sender_of, strata_of, turn_to_world
-from icheat_usd.kernels.mask_table import weight_of_entry
+from icheat_usd.kernels.caster_sums import N_VALUES, add_weighted, ray_weights, turn_to_world
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.simd import (
@@ -30,6 +29,10 @@ from icheat_usd.kernels.simd import (
     scaled,
     store_color,
 )
+from icheat_usd.kernels.texels import corner_texels, texel_weight
+
+#: Casters whose edits are remembered while the rays of a record are looked at.
+_HELD = 8
 
 
 class StackTable(NamedTuple):
@@ -51,90 +54,116 @@ class SlotTable(NamedTuple):
     derived: NDArray[np.int64]  #: (n_slots + 1,) first derivative of each slot
 
 
-class _Scratch(NamedTuple):
-    """Room for the edits that act on one caster."""
+class _Lines(NamedTuple):
+    """Edits that act on the last few casters, up to n_rows of each, for the slots of one record.
 
-    row: NDArray[np.int32]  #: (n_rows,) ascending
-    entry: NDArray[np.int64]  #: (n_rows,)
-    weight: NDArray[np.float32]  #: (n_rows,) of the caster
-    past: NDArray[np.float32]  #: (n_rows, 4) x before each
-    factor: NDArray[np.float32]  #: (n_rows, 4)
+    Compiled loops read these arrays by themselves, as to look into a tuple for every ray took half the time. What
+    they know by its address alone lives here, so that it lives as long.
+    """
+
+    caster: NDArray[np.int64]  #: (_HELD,) instance, -1 for none
+    number: NDArray[np.int64]  #: (_HELD,) edits that act on it
+    is_last: NDArray[np.uint8]  #: (_HELD * n_rows,) whether no other key of the edit follows
+    painted: NDArray[np.int64]  #: (_HELD * n_rows,) first texel of the instance in the mask, -1 for none
+    resolution: NDArray[np.int64]  #: (_HELD * n_rows,)
+    weight: NDArray[np.float32]  #: (_HELD * n_rows,) all over the instance
+    row: NDArray[np.int64]  #: (_HELD * n_rows,)
+    at_hit: NDArray[np.float32]  #: (n_rows,) weights where a ray ends
+    past: NDArray[np.float32]  #: (n_rows, 4) x before each edit
+    factor: NDArray[np.float32]  #: (n_rows, 4) what it was multiplied by
+    line: NDArray[np.float32]  #: (n_rows, n_blocks, 2, 4) slope and shift
+    own: NDArray[np.float32]  #: (_HELD, n_slots, n_blocks, n_rows, 2, 4) slope and shift times the masks of each slot
 
 
 @kernel
-def _scratch(n_rows):  # type: ignore[no-untyped-def]
-    return _Scratch(
-        np.empty(n_rows, np.int32),
-        np.empty(n_rows, np.int64),
+def _no_lines(n_slots, stack):  # type: ignore[no-untyped-def]
+    n_rows, n_blocks = stack.slope.shape[0], stack.slope.shape[1]
+    line = np.empty((n_rows, n_blocks, 2, 4), np.float32)
+    line[:, :, 0] = stack.slope
+    line[:, :, 1] = stack.shift
+    n = _HELD * n_rows
+    return _Lines(
+        np.full(_HELD, -1, np.int64),
+        np.zeros(_HELD, np.int64),
+        np.empty(n, np.uint8),
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+        np.empty(n, np.float32),
+        np.empty(n, np.int64),
         np.empty(n_rows, np.float32),
         np.empty((n_rows, 4), np.float32),
         np.empty((n_rows, 4), np.float32),
+        line,
+        np.empty((_HELD, n_slots, n_blocks, n_rows, 2, 4), np.float32),
     )
 
 
 @kernel
-def _list_active(i, first, end, casters, slots, scratch):  # type: ignore[no-untyped-def]
-    """Rows that have casters on an instance and that receivers of some slots are in, or would be nearby."""
-    n = 0
+def _hold(i, first, end, casters, stack, slots, lines):  # type: ignore[no-untyped-def]
+    """Keep the edits that act on an instance, and that receivers of the slots are in or would be nearby."""
+    held, n_rows, n_blocks = i % _HELD, len(stack.edit), stack.slope.shape[1]
+    n, edit = 0, -1
     for e in range(casters.begin[i], casters.begin[i + 1]):
         row = casters.row[e]
+        acts = False
         for s in range(first, end):
-            if slots.masks[s, row] != np.float32(0.0) or slots.place[slots.pattern[s], row] >= 0:
-                scratch.row[n], scratch.entry[n] = row, e
-                n += 1
-                break
-    return n
+            acts |= slots.masks[s, row] != np.float32(0.0) or slots.place[slots.pattern[s], row] >= 0
+        if not acts:
+            continue
+        q = held * n_rows + n
+        if stack.edit[row] == edit:
+            lines.is_last[q - 1] = 0
+        edit = stack.edit[row]
+        mask = casters.mask[e]
+        lines.is_last[q], lines.row[q], lines.weight[q], lines.painted[q] = 1, row, casters.weight[e], -1
+        if mask >= 0:
+            size = casters.resolution[mask]
+            lines.painted[q] = casters.texel_begin[mask] + casters.first_face[e] * size * size
+            lines.resolution[q] = size
+        for s in range(first, end):
+            for block in range(n_blocks):
+                for c in range(4):
+                    lines.own[held, s - first, block, n, 0, c] = slots.masks[s, row] * stack.slope[row, block, c]
+                    lines.own[held, s - first, block, n, 1, c] = slots.masks[s, row] * stack.shift[row, block, c]
+        n += 1
+    lines.caster[held], lines.number[held] = i, n
 
 
 @kernel
-def _composed(block, s, n, stack, slots, scratch):  # type: ignore[no-untyped-def]
-    """Change of one block of S or E by the first `n` rows of the scratch, for slot `s`."""
-    slope_0, shift_0 = address_of(stack.slope), address_of(stack.shift)
-    past_0, factor_0 = address_of(scratch.past), address_of(scratch.factor)
-    n_blocks = stack.slope.shape[1]
+def _composed(own_0, is_last, base, n, weight, start, past_0, factor_0):  # type: ignore[no-untyped-def]
+    """Change of a block of S or E by `n` edits, whose lines are at an address; what derivatives need goes to others."""
     one = color_of(np.float32(1.0), np.float32(1.0), np.float32(1.0))
-    start = load_color(address_of(stack.start) + 16 * block)
-    x = start
-    q = 0
-    while q < n:
-        edit = stack.edit[scratch.row[q]]
-        a, b = one, black()
-        while q < n and stack.edit[scratch.row[q]] == edit:
-            row = np.int64(scratch.row[q])
-            weight = slots.masks[s, row] * scratch.weight[q]
-            at = 16 * (row * n_blocks + block)
-            a = scale_add(load_color(slope_0 + at), weight, a)
-            b = scale_add(load_color(shift_0 + at), weight, b)
-            store_color(past_0 + 16 * q, x)
-            q += 1
-        store_color(factor_0 + 16 * (q - 1), a)
-        x = color_add(a, x, b)
+    x, a, b = start, one, black()
+    for q in range(n):
+        a = scale_add(load_color(own_0 + 32 * q), weight[q], a)
+        b = scale_add(load_color(own_0 + 32 * q + 16), weight[q], b)
+        store_color(past_0 + 16 * q, x)
+        store_color(factor_0 + 16 * q, a)
+        if is_last[base + q]:
+            x = color_add(a, x, b)
+            a, b = one, black()
     return difference(x, start)
 
 
 @kernel
-def _derive(block, s, n, stack, slots, scratch, light, derivative):  # type: ignore[no-untyped-def]
-    """Add the derivatives of a light's change by masks of the receiver, after `_composed`."""
-    slope_0, shift_0 = address_of(stack.slope), address_of(stack.shift)
-    past_0, factor_0 = address_of(scratch.past), address_of(scratch.factor)
-    out_0 = address_of(derivative) + 16 * slots.derived[s]
-    n_blocks = stack.slope.shape[1]
-    after = light
-    q = n - 1
-    while q >= 0:
-        edit = stack.edit[scratch.row[q]]
-        a = load_color(factor_0 + 16 * q)
-        while q >= 0 and stack.edit[scratch.row[q]] == edit:
-            row = np.int64(scratch.row[q])
-            place = np.int64(slots.place[slots.pattern[s], row])
-            if place >= 0:
-                at = 16 * (row * n_blocks + block)
-                own = color_add(load_color(slope_0 + at), load_color(past_0 + 16 * q), load_color(shift_0 + at))
-                to = out_0 + 16 * place
-                own = scaled(own, scratch.weight[q])
-                store_color(to, color_add(own, after, load_color(to)))
-            q -= 1
-        after = color_product(after, a)
+def _derive(line_0, step, row, place, pattern, is_last, base, n, weight, past_0, factor_0, light, out_0):  # type: ignore[no-untyped-def]
+    """Add the derivatives of a light's change by masks of the receiver, after `_composed`.
+
+    `line_0` is the address of a block's slope in the first row, `step` the bytes from one row's to the next; `pattern`
+    is where places of derivatives begin.
+    """
+    after, before = light, light
+    for k in range(n):
+        q = n - 1 - k
+        if is_last[base + q]:
+            after = before
+            before = color_product(after, load_color(factor_0 + 16 * q))
+        to = np.int64(place[pattern + row[base + q]])
+        if to >= 0:
+            line = line_0 + step * row[base + q]
+            own = color_add(load_color(line), load_color(past_0 + 16 * q), load_color(line + 16))
+            to = out_0 + 16 * to
+            store_color(to, color_add(scaled(own, weight[q]), after, load_color(to)))
 
 
 @parallel_kernel
@@ -157,24 +186,46 @@ def stack_of_casters(begin, caster, light, casters, stack, slots, records, value
 @kernel
 def _of_casters(r, begin, caster, light, casters, stack, slots, values, derivative):  # type: ignore[no-untyped-def]
     first, end = slots.begin[r], slots.begin[r + 1]
-    scratch = _scratch(len(stack.edit))
-    light_0, values_0 = address_of(light), address_of(values)
-    n_blocks = stack.slope.shape[1]
+    n_rows, n_blocks = stack.slope.shape[0], stack.slope.shape[1]
+    lines = _no_lines(end - first, stack)
+    number, is_last, row, on_caster = lines.number, lines.is_last, lines.row, lines.weight
+    place, weight = slots.place.reshape(-1), lines.at_hit
+    past_0, factor_0 = address_of(lines.past), address_of(lines.factor)
+    own_0, line_0 = address_of(lines.own), address_of(lines.line)
+    light_0, values_0, start_0 = address_of(light), address_of(values), address_of(stack.start)
+    derivative_0 = address_of(derivative)
     for e in range(begin[r], begin[r + 1]):
-        n = _list_active(caster[e], first, end, casters, slots, scratch)
-        if n == 0:
-            continue
+        i = np.int64(caster[e])
+        _hold(i, first, end, casters, stack, slots, lines)
+        held = i % _HELD
+        n, base = number[held], held * n_rows
         for q in range(n):
-            scratch.weight[q] = casters.weight[scratch.entry[q]]
+            weight[q] = on_caster[base + q]
         for s in range(first, end):
             for block in range(n_blocks):
-                change = _composed(block, s, n, stack, slots, scratch)
+                own = own_0 + 32 * n_rows * ((held * (end - first) + s - first) * n_blocks + block)
+                start = load_color(start_0 + 16 * block)
+                change = _composed(own, is_last, base, n, weight, start, past_0, factor_0)
                 at = light_0 + 16 * N_VALUES * (e * light.shape[1] + block)
                 for v in range(N_VALUES):
                     to = values_0 + 16 * (N_VALUES * s + v)
                     store_color(to, color_add(change, load_color(at + 16 * v), load_color(to)))
                 if slots.derived[s] < slots.derived[s + 1]:
-                    _derive(block, s, n, stack, slots, scratch, load_color(at), derivative)
+                    _derive(
+                        line_0 + 32 * block,
+                        32 * n_blocks,
+                        row,
+                        place,
+                        n_rows * slots.pattern[s],
+                        is_last,
+                        base,
+                        n,
+                        weight,
+                        past_0,
+                        factor_0,
+                        load_color(at),
+                        derivative_0 + 16 * slots.derived[s],
+                    )
 
 
 @parallel_kernel
@@ -218,71 +269,130 @@ def stack_of_rays(  # type: ignore[no-untyped-def]
     for g in prange(len(record)):
         for q in range(group[g], group[g + 1]):
             r = order[q]
-            own = strata_of(turn_of(hash_combine(seed, rays.stream[r])), n_theta, n_phi, share[record[g]])
-            _of_rays(r, record[g], rays, face, face_uv, sent, own, casters, stack, slots, values, derivative)
+            turn = turn_of(hash_combine(seed, rays.stream[r]))
+            _of_rays(
+                r,
+                record[g],
+                rays,
+                face,
+                face_uv,
+                sent,
+                share[record[g]],
+                turn,
+                n_theta,
+                n_phi,
+                casters,
+                stack,
+                slots,
+                values,
+                derivative,
+            )
 
 
 @kernel
-def _of_rays(r, record, rays, face, face_uv, sent, strata, casters, stack, slots, values, derivative):  # type: ignore[no-untyped-def]
+def _of_rays(  # type: ignore[no-untyped-def]
+    r,
+    record,
+    rays,
+    face,
+    face_uv,
+    sent,
+    factor,
+    first_turn,
+    n_theta,
+    n_phi,
+    casters,
+    stack,
+    slots,
+    values,
+    derivative,
+):
     first, end = slots.begin[record], slots.begin[record + 1]
-    scratch = _scratch(len(stack.edit))
-    n_blocks, n_phi, n_rays = stack.slope.shape[1], len(strata.across), rays.cell.shape[1]
-    sums = np.zeros((end - first, 5, 4), np.float32)
+    n_slots = end - first
+    n_rows, n_blocks = stack.slope.shape[0], stack.slope.shape[1]
+    n_rays = rays.cell.shape[1]
+    weights = np.empty((n_rays, 4), np.float32)
+    ray_weights(rays.distance, r, first_turn, n_theta, n_phi, factor, weights)
+    lines = _no_lines(n_slots, stack)
+    caster, number, is_last, row = lines.caster, lines.number, lines.is_last, lines.row
+    painted, resolution, on_caster = lines.painted, lines.resolution, lines.weight
+    texels, weight = casters.texels, lines.at_hit
+    place, pattern, derived = slots.place.reshape(-1), slots.pattern, slots.derived
+    past_0, factor_0 = address_of(lines.past), address_of(lines.factor)
+    own_0, line_0 = address_of(lines.own), address_of(lines.line)
+    sums = np.zeros((n_slots, 5, 4), np.float32)
     sums_0, sent_0, throughput_0 = address_of(sums), address_of(sent), address_of(rays.throughput)
-    share = np.float32(strata.share)
-    d = rays.detour_begin[r]
+    start_0, derivative_0 = address_of(stack.start), address_of(derivative)
+    cell, instance, triangle, uv = rays.cell, rays.instance, rays.triangle, rays.uv
+    detour, end_instance, end_face, end_face_uv = rays.detour, rays.end_instance, rays.end_face, rays.end_face_uv
+    share = np.float32(np.pi / n_rays * factor)
+    d, d_end, adjusted_ray = rays.detour_begin[r], rays.detour_begin[r + 1], rays.adjusted
     adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
-    last, n = -1, 0
-    for j in range(len(strata.slope)):
-        for k in range(n_phi):
-            ray = j * n_phi + k
-            i = sender_of(rays, r, ray, d)
-            is_detour = d < rays.detour_begin[r + 1] and rays.detour[d] == r * n_rays + ray
-            if is_detour:
-                d += 1
-            is_adjusted = adjusted < adjusted_end and rays.adjusted[adjusted] == r * n_rays + ray
+    for ray in range(n_rays):
+        i = np.int64(instance[r, ray]) if cell[r, ray] >= 0 else np.int64(-1)
+        is_detour = d < d_end and detour[d] == r * n_rays + ray
+        if is_detour:
+            i = np.int64(end_instance[d])
+            d += 1
+        is_adjusted = adjusted < adjusted_end and adjusted_ray[adjusted] == r * n_rays + ray
+        if is_adjusted:
+            adjusted += 1
+        if i < 0:
+            continue
+        held = i % _HELD
+        if caster[held] != i:
+            _hold(i, first, end, casters, stack, slots, lines)
+        n, base = number[held], held * n_rows
+        if n == 0:
+            continue
+        if is_detour:
+            own_face = np.int64(end_face[d - 1])
+            at_s, at_t = end_face_uv[d - 1, 0], end_face_uv[d - 1, 1]
+        else:
+            hit = triangle[r, ray]
+            own_face = np.int64(face[hit])
+            v, w = uv[r, ray, 0], uv[r, ray, 1]
+            u = np.float32(1.0) - v - w
+            at_s = u * face_uv[hit, 0, 0] + v * face_uv[hit, 1, 0] + w * face_uv[hit, 2, 0]
+            at_t = u * face_uv[hit, 0, 1] + v * face_uv[hit, 1, 1] + w * face_uv[hit, 2, 1]
+        acts = False
+        last, corners = np.int64(1), corner_texels(np.int64(1), at_s, at_t)
+        for q in range(n):
+            own_weight = on_caster[base + q]
+            if painted[base + q] >= 0:
+                size = resolution[base + q]
+                if size != last:
+                    last, corners = size, corner_texels(size, at_s, at_t)
+                own_weight *= texel_weight(texels, painted[base + q] + own_face * size * size, corners)
+            weight[q] = own_weight
+            acts |= own_weight != np.float32(0.0)
+        if not acts:
+            continue
+        for block in range(n_blocks):
+            light = load_color(sent_0 + 16 * (np.int64(cell[r, ray]) * n_blocks + block))
             if is_adjusted:
-                adjusted += 1
-            if i < 0:
-                continue
-            if i != last:
-                n, last = _list_active(i, first, end, casters, slots, scratch), i
-            if n == 0 or not _weigh(r, ray, d if is_detour else -1, n, rays, face, face_uv, casters, scratch):
-                continue
-            ga, gb, a, b = ray_weights(strata, rays.distance, r, j, k)
-            for block in range(n_blocks):
-                light = load_color(sent_0 + 16 * (np.int64(rays.cell[r, ray]) * n_blocks + block))
-                if is_adjusted:
-                    light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
-                for s in range(first, end):
-                    change = color_product(_composed(block, s, n, stack, slots, scratch), light)
-                    add_weighted(sums_0 + 80 * (s - first), change, share, ga, gb, a, b)
-                    if slots.derived[s] < slots.derived[s + 1]:
-                        _derive(block, s, n, stack, slots, scratch, scaled(light, share), derivative)
+                light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
+            start = load_color(start_0 + 16 * block)
+            for s in range(n_slots):
+                own = own_0 + 32 * n_rows * ((held * n_slots + s) * n_blocks + block)
+                change = _composed(own, is_last, base, n, weight, start, past_0, factor_0)
+                add_weighted(sums_0 + 80 * s, color_product(change, light), share, weights, ray)
+                if derived[first + s] < derived[first + s + 1]:
+                    _derive(
+                        line_0 + 32 * block,
+                        32 * n_blocks,
+                        row,
+                        place,
+                        n_rows * pattern[first + s],
+                        is_last,
+                        base,
+                        n,
+                        weight,
+                        past_0,
+                        factor_0,
+                        scaled(light, share),
+                        derivative_0 + 16 * derived[first + s],
+                    )
     nx, ny, nz = rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2]
-    for s in range(first, end):
-        turn_to_world(sums[s - first], nx, ny, nz, values[s])
-
-
-@kernel
-def _weigh(r, ray, detour, n, rays, face, face_uv, casters, scratch):  # type: ignore[no-untyped-def]
-    """Weights of the place that a ray ends in, in the rows of the scratch; False if all are 0.
-
-    `detour` is the number after that of the ray's detour, -1 if it made none.
-    """
-    if detour >= 0:
-        own_face = rays.end_face[detour - 1]
-        s, t = rays.end_face_uv[detour - 1, 0], rays.end_face_uv[detour - 1, 1]
-    else:
-        q = rays.triangle[r, ray]
-        own_face = face[q]
-        v, w = rays.uv[r, ray, 0], rays.uv[r, ray, 1]
-        u = np.float32(1.0) - v - w
-        s = u * face_uv[q, 0, 0] + v * face_uv[q, 1, 0] + w * face_uv[q, 2, 0]
-        t = u * face_uv[q, 0, 1] + v * face_uv[q, 1, 1] + w * face_uv[q, 2, 1]
-    found = False
-    for q in range(n):
-        weight = weight_of_entry(casters, scratch.entry[q], own_face, s, t)
-        scratch.weight[q] = weight
-        found |= weight != np.float32(0.0)
-    return found
+    for s in range(n_slots):
+        turn_to_world(sums[s], nx, ny, nz, values[first + s])

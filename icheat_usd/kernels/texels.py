@@ -69,14 +69,21 @@ def _bilinear(texels, uv):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def texel_weight(texels, first, resolution, s, t):  # type: ignore[no-untyped-def]
-    """Bilinear weight at one place of a face whose texels are ``texels[first:first + resolution**2]``."""
+def corner_texels(resolution, s, t):  # type: ignore[no-untyped-def]
+    """Numbers of the four texels around a place of a face, row by row, and how far it is towards the later ones."""
     x0, y0 = _low_texel(s, resolution), _low_texel(t, resolution)
     x1, y1 = min(x0 + 1, resolution - 1), min(y0 + 1, resolution - 1)
     x, y = _texel_place(s, resolution) - np.float32(x0), _texel_place(t, resolution) - np.float32(y0)
+    return y0 * resolution + x0, y0 * resolution + x1, y1 * resolution + x0, y1 * resolution + x1, x, y
+
+
+@kernel
+def texel_weight(texels, first, corners):  # type: ignore[no-untyped-def]
+    """Bilinear weight at `corner_texels` of a face whose first texel is ``texels[first]``."""
+    top_left, top_right, left, right, x, y = corners
     one = np.float32(1)
-    top = texels[first + y0 * resolution + x0] * (one - x) + texels[first + y0 * resolution + x1] * x
-    bottom = texels[first + y1 * resolution + x0] * (one - x) + texels[first + y1 * resolution + x1] * x
+    top = texels[first + top_left] * (one - x) + texels[first + top_right] * x
+    bottom = texels[first + left] * (one - x) + texels[first + right] * x
     return top * (one - y) + bottom * y
 
 
