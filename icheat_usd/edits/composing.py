@@ -108,14 +108,20 @@ def _pick(entry: Any, which: Any, n: int) -> Any:
 
 def pair_weights(bound: BoundEdit, rows: range, receivers: Ends, casters: Ends, first_located: int) -> list[F32]:
     """Amount x key weight x u x w of each key, (n,) each."""
+    shares = key_shares(bound, receivers.located[first_located : first_located + bound.n_keys])
+    return [share * receivers.masks[row] * casters.masks[row] for share, row in zip(shares, rows, strict=True)]
+
+
+def key_shares(bound: BoundEdit, located: Sequence[Any]) -> list[Any]:
+    """Amount x key weight of each key, at receivers whose rows are `located`: numbers, or (n,) each."""
     shares: list[Any] = [np.float32(bound.edit.amount * weight) for weight in bound.key_weights]
     if bound.n_keys > 1 and all(key_rows is not None for key_rows in bound.rows):
         # Where one key has no samples, the other speaks alone: disocclusion is no reason to fade.
-        confidence = [receivers.located[first_located + k].confidence for k in range(bound.n_keys)]
+        confidence = [mixture.confidence for mixture in located]
         total = sum(w * c for w, c in zip(bound.key_weights, confidence, strict=True))
         safe = np.where(total > 0, total, ONE)
         shares = [share * (c / safe).astype(np.float32) for share, c in zip(shares, confidence, strict=True)]
-    return [share * receivers.masks[row] * casters.masks[row] for share, row in zip(shares, rows, strict=True)]
+    return shares
 
 
 def _seen(state: State, bound: BoundEdit, b: F32, groups: I64, which: Any) -> F32:

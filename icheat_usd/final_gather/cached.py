@@ -22,6 +22,7 @@ from icheat_usd.final_gather.hemispheres import Hemispheres, Part
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, Places
 from icheat_usd.final_gather.light_parts import light_of_records
 from icheat_usd.final_gather.receiver_sets import MOST_SOFT, soft_masks, touched
+from icheat_usd.final_gather.row_records import RowRecords
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
@@ -101,7 +102,7 @@ class Sampled(NamedTuple):
     own_rays: Hemispheres | None  #: of these
 
 
-def under_stack(g: Gatherer, records: MaskedRecords | EditedRecords, sampled: Sampled) -> F32:
+def under_stack(g: Gatherer, records: MaskedRecords | RowRecords | EditedRecords, sampled: Sampled) -> F32:
     """Light of camera samples under the stack of a gatherer, (n, 3); where no edit acts the bits of `base`."""
     points, base, shiny = sampled.points, sampled.base, sampled.shiny
     edited = base.copy()
@@ -171,7 +172,7 @@ class CachedParts:
         cells = np.concatenate(sent, axis=1)
         self._cells = np.concatenate([cells, np.zeros((1, cells.shape[1]), np.float32)])
         self._values = light_of_records(cache, self._cells)
-        self._records: list[MaskedRecords | EditedRecords | None] = [None for _ in parts]
+        self._records: list[MaskedRecords | RowRecords | EditedRecords | None] = [None for _ in parts]
 
     def take_edits(self, hemispheres: Hemispheres) -> None:
         """Edit the light of the parts, too."""

@@ -17,8 +17,10 @@ from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, RecordValues
 from icheat_usd.final_gather.masked_records import MaskedRecords
-from icheat_usd.final_gather.receiver_sets import Mixtures, Touched, mixtures
+from icheat_usd.final_gather.receiver_sets import Mixtures, Touched, mixtures_of
 from icheat_usd.final_gather.record_rays import RecordRays, take_rays
+from icheat_usd.final_gather.row_records import RowRecords
+from icheat_usd.final_gather.row_stack import is_of_rows
 from icheat_usd.kernels import record_mixtures as kernels
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
@@ -28,10 +30,11 @@ _STEP = 0.1  # of a record's reach, or radians: from how far beside a record a r
 
 def edited_records(
     gatherer: Gatherer, cache: IrradianceCache, hemispheres: Hemispheres
-) -> MaskedRecords | EditedRecords:
+) -> MaskedRecords | RowRecords | EditedRecords:
     """Changes that a gatherer's stack makes of the light of a cache's records."""
-    is_summed = is_of_masks(gatherer.field)
-    return (MaskedRecords if is_summed else EditedRecords)(gatherer, cache, hemispheres)
+    if is_of_masks(gatherer.field):
+        return MaskedRecords(gatherer, cache, hemispheres)
+    return (RowRecords if is_of_rows(gatherer.field) else EditedRecords)(gatherer, cache, hemispheres)
 
 
 class EditedRecords:
@@ -66,7 +69,7 @@ class EditedRecords:
         (m, 3) float32
         """
         cache, where, which = self._cache, receivers.where, receivers.which
-        mixed = _mixtures_of(receivers)
+        mixed = mixtures_of(receivers)
         needed = np.zeros((len(mixed.is_in), cache.n), np.uint8)
         kernels.mark_records(found.number, found.record, where, which, mixed.begin, mixed.entry, needed)
         self._prepare(mixed, needed.view(np.bool_))
@@ -139,12 +142,6 @@ class EditedRecords:
 
 def _no_values(n: int) -> RecordValues:
     return RecordValues(np.zeros((n, 3), np.float32), *(np.zeros((n, 3, 3), np.float32) for _ in range(2)))
-
-
-def _mixtures_of(receivers: Touched) -> Mixtures:
-    used = np.zeros(receivers.columns.shape[1], np.bool_)
-    used[receivers.which] = True
-    return mixtures(receivers.columns, used)
 
 
 class RecordPairs:

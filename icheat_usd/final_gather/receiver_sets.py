@@ -117,6 +117,13 @@ def mixtures(columns: F32, wanted: Bool) -> Mixtures:
     )
 
 
+def mixtures_of(receivers: Touched) -> Mixtures:
+    """The same for the masks of some receivers."""
+    used = np.zeros(receivers.columns.shape[1], np.bool_)
+    used[receivers.which] = True
+    return mixtures(receivers.columns, used)
+
+
 def soft_masks(masks: F32) -> I64:
     """(m,) how many masks (n_rows, m) of each receiver lie between 0 and 1."""
     found: I64 = ((masks > 0) & (masks < 1)).sum(axis=0)

@@ -237,6 +237,54 @@ def decode_rows(left, right, weight, node_weight, indptr, indices, numbers, step
 
 
 @parallel_kernel
+def decode_columns(left, right, left_share, right_share, indptr, indices, numbers, columns, steps, pattern, out):  # type: ignore[no-untyped-def]
+    """`decode_rows` of some columns, one after another: (n_rows, n_columns, n_leaves).
+
+    Parameters
+    ----------
+    left_share, right_share : (n_nodes,) float64
+        Of each node's weight, that of its children.
+    columns : (c,) int64, steps : (n_rows, c) float32
+    """
+    for r in prange(len(pattern)):
+        _decode_columns(r, left, right, left_share, right_share, indptr, indices, numbers, columns, steps, pattern, out)
+
+
+@kernel
+def _decode_columns(r, left, right, left_share, right_share, indptr, indices, numbers, columns, steps, pattern, out):  # type: ignore[no-untyped-def]
+    n_nodes = len(left)
+    mean = np.empty(max(n_nodes, 1), np.float64)
+    begin, end = indptr[pattern[r]], indptr[pattern[r] + 1]
+    for k in range(len(columns)):
+        c = columns[k]
+        step = np.float64(steps[r, k])
+        e = begin
+        mean[0] = 0.0
+        if e < end and indices[e] == 0:
+            mean[0] = numbers[e, c] * step
+            e += 1
+        if n_nodes == 0:
+            out[r, k, 0] = mean[0]
+        for node in range(n_nodes):
+            m_i = mean[node]
+            m_j = m_i
+            if e < end and indices[e] == 1 + node:
+                difference = numbers[e, c] * step
+                m_i += right_share[node] * difference
+                m_j -= left_share[node] * difference
+                e += 1
+            i, j = left[node], right[node]
+            if i < 0:
+                out[r, k, -1 - i] = m_i
+            else:
+                mean[i] = m_i
+            if j < 0:
+                out[r, k, -1 - j] = m_j
+            else:
+                mean[j] = m_j
+
+
+@parallel_kernel
 def mix_decoded(table, rows, weights, leaf, out):  # type: ignore[no-untyped-def]
     """Mixtures of decoded rows at leaves: ``out[q] = sum of weights[q, s] * table[rows[q, s], leaf[q]]``.
 

@@ -140,15 +140,18 @@ def build_search(key, begin, order, axis):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _neighbours(key, axis, lo, hi, place, stack, bound, near, distance):  # type: ignore[no-untyped-def]
-    """The nearest points of a range, at most ``len(near)``, nearest first; returns how many."""
+def _neighbours(key, axis, lo, hi, place, within, stack, bound, near, distance):  # type: ignore[no-untyped-def]
+    """The nearest points of a range, at most ``len(near)``, nearest first; returns how many.
+
+    That many are known to lie no further than the square root of `within`, which saves looking elsewhere.
+    """
     found, top = 0, 1
     stack[0, 0], stack[0, 1], bound[0] = lo, hi, 0.0
     limit = len(near)
     while top > 0:
         top -= 1
         lo, hi = stack[top, 0], stack[top, 1]
-        if hi <= lo or (found == limit and bound[top] > distance[limit - 1]):
+        if hi <= lo or bound[top] > within or (found == limit and bound[top] > distance[limit - 1]):
             continue
         middle = (lo + hi) // 2
         d = 0.0
@@ -175,6 +178,18 @@ def _neighbours(key, axis, lo, hi, place, stack, bound, near, distance):  # type
     return found
 
 
+@kernel
+def _furthest(key, near, place):  # type: ignore[no-untyped-def]
+    """Square of the largest distance of some points."""
+    largest = 0.0
+    for slot in range(len(near)):
+        d = 0.0
+        for c in range(key.shape[1]):
+            d += (key[near[slot], c] - place[c]) ** 2
+        largest = max(largest, d)
+    return largest
+
+
 @parallel_kernel
 def mixtures(  # type: ignore[no-untyped-def]
     key, axis, begin, normal, reach, row, group, place, place_normal, out_row, out_weight, out_confidence, out_nearest
@@ -195,6 +210,7 @@ def mixtures(  # type: ignore[no-untyped-def]
         distance = np.empty(NEIGHBOURS + 1, np.float64)
         share = np.empty(NEIGHBOURS, np.float64)
         mixed = np.empty(NEIGHBOURS, np.float64)
+        last, found = np.int64(-1), np.int64(0)
         for q in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
             out_confidence[q] = 0.0
             out_nearest[q, 0] = -1.0
@@ -205,7 +221,12 @@ def mixtures(  # type: ignore[no-untyped-def]
             g = group[q]
             if g < 0 or begin[g] == begin[g + 1]:
                 continue
-            found = _neighbours(key, axis, begin[g], begin[g + 1], place[q], stack, bound, near, distance)
+            # Places come in the order of pixels: the neighbours of the last one are near this one, too.
+            within = np.inf
+            if g == last and found > NEIGHBOURS:
+                within = _furthest(key, near, place[q])
+            found = _neighbours(key, axis, begin[g], begin[g + 1], place[q], within, stack, bound, near, distance)
+            last = g
             used = min(found, NEIGHBOURS)
             for s in range(found):
                 distance[s] = np.sqrt(distance[s])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -68,7 +69,6 @@ class BoundRows:
     findings: tuple[Finding, ...]
     cell: I32  #: (n_leaves,) cell of each leaf
     coefficients: _Coefficients
-    table: F32 | None  #: (n_rows, n_cells, n_columns) decoded, if it is small enough
     search: _Search
     locator: Locator
     on_side: I32  #: (2 n_instances,) group of leaves of each side, -1 where it has none
@@ -76,6 +76,49 @@ class BoundRows:
     @property
     def has_offset(self) -> bool:
         return "offset" in self.rows.kinds
+
+    @property
+    def n_cells(self) -> int:
+        return len(self.coefficients.weight)
+
+    @property
+    def n_distinct(self) -> int:
+        return 1 + int(self.rows.distinct_columns.max(initial=-1))
+
+    @cached_property
+    def table(self) -> F32 | None:
+        """(n_rows, n_cells, n_columns) decoded, if it is small enough."""
+        c, shape = self.coefficients, (len(self.rows.row_pattern), self.n_cells, self.rows.n_columns)
+        if 4 * np.prod(shape, dtype=np.int64) > TABLE_BYTES:
+            return None
+        table = np.empty(shape, np.float32)
+        row_coding.decode_rows(
+            c.left, c.right, c.weight, c.node_weight, c.indptr, c.indices, c.numbers, c.steps, c.pattern, table
+        )
+        return table
+
+    def decode(self, rows: I64) -> F32:
+        """Some rows, (n, n_distinct, n_cells) float32; see `SampledRows.distinct_columns`."""
+        c = self.coefficients
+        first = np.unique(self.rows.distinct_columns, return_index=True)[1]
+        out = np.empty((len(rows), len(first), self.n_cells), np.float32)
+        steps = np.ascontiguousarray(c.steps[rows][:, first])
+        row_coding.decode_columns(
+            c.left, c.right, *self._shares, c.indptr, c.indices, c.numbers, first, steps, c.pattern[rows], out
+        )
+        return out
+
+    @cached_property
+    def _shares(self) -> tuple[F64, F64]:
+        """Share of each node's weight that its children have."""
+        c = self.coefficients
+        a, b = (
+            np.where(child < 0, c.weight[np.maximum(-1 - child, 0)], c.node_weight[np.maximum(child, 0)])
+            if len(child)
+            else np.zeros(0)
+            for child in (c.left, c.right)
+        )
+        return a / (a + b), b / (a + b)
 
     def locate_receivers(self, points: SurfacePoints) -> Mixture:
         """Rows around each point, by place and normal on the same side of the same surface.
@@ -155,21 +198,12 @@ def bind_rows(rows: SampledRows, snapshot: SceneSnapshot, where: str) -> BoundRo
     leaves = find_places(rows.leaves, rows.surfaces, rows.bounds, snapshot, where)
     sites = find_places(rows.sites, rows.surfaces, rows.bounds, snapshot, where)
     coefficients, cell = _contracted(rows)
-    table = None
-    n_cells = len(coefficients.weight)
-    if 4 * len(rows.row_pattern) * n_cells * rows.n_columns <= TABLE_BYTES:
-        table = np.empty((len(rows.row_pattern), n_cells, rows.n_columns), np.float32)
-        c = coefficients
-        row_coding.decode_rows(
-            c.left, c.right, c.weight, c.node_weight, c.indptr, c.indices, c.numbers, c.steps, c.pattern, table
-        )
     locator, on_side = _leaf_locator(rows, leaves.points, snapshot)
     return BoundRows(
         rows,
         tuple(dict.fromkeys(leaves.findings + sites.findings)),
         cell,
         coefficients,
-        table,
         _search(rows, sites.points, snapshot),
         locator,
         on_side,
@@ -226,8 +260,11 @@ def _leaf_locator(rows: SampledRows, points: SurfacePoints, snapshot: SceneSnaps
     area = instance_areas(snapshot)
     group_area = np.bincount(on_side[side], area[instance[here]], len(ranges)).astype(np.float64)
     shape = tree_shape(rows.split_size, rows.n_leaves)
-    node_of = {(int(a), int(b)): i for i, (a, b) in enumerate(zip(shape.lo, shape.hi, strict=True))}
-    nodes = np.array([node_of.get((int(a), int(b)), -1) for a, b in ranges], np.int32)
+    # Of the nodes that begin with a leaf, one ends with another at most.
+    nodes = np.full(len(ranges), -1, np.int32)
+    for one, (first, last) in enumerate(ranges.tolist()):
+        found = np.flatnonzero((shape.lo == first) & (shape.hi == last))
+        nodes[one] = found[0] if len(found) else -1
     begin = np.concatenate([ranges[:, 0], [rows.n_leaves]]).astype(np.int64)
     shape = replace(shape, group_node=nodes)
     depth = rows.tree.depth

@@ -91,6 +91,23 @@ class SampledRows:
         return build_tree(tree_shape(self.split_size, self.n_leaves), self.leaf_area.astype(np.float64), b"rows")
 
     @cached_property
+    def distinct_columns(self) -> I64:
+        """(n_columns,) which of the different columns each one is: most edits are grey, or add nothing."""
+        found: list[int] = []
+        number = np.zeros(self.n_columns, np.int64)
+        for column in range(self.n_columns):
+            like = [
+                k
+                for k, other in enumerate(found)
+                if np.array_equal(self.row_step[:, column], self.row_step[:, other])
+                and np.array_equal(self.numbers[:, column], self.numbers[:, other])
+            ]
+            number[column] = like[0] if like else len(found)
+            if not like:
+                found.append(column)
+        return number
+
+    @cached_property
     def samples_digest(self) -> str:
         """Names the gather samples and the basis: rows of equal digests can be mixed by coefficients."""
         digest = hashlib.sha256(self.tree.digest.encode())

@@ -1,0 +1,267 @@
+"""What edits held as sampled rows make of the light of cache records.
+
+A receiver mixes the rows of the samples around it. Its weights are no part of a record: records keep the light that
+each row near them would bring, with gradients, and camera samples mix these by their own weights. So one edit is as
+exact as the unedited light is. Where several edits act on a receiver, their product is taken as straight in the
+weights of each, about those at the record.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.edits.bound import Ends
+from icheat_usd.final_gather.gatherer import Gatherer
+from icheat_usd.final_gather.hemispheres import Hemispheres
+from icheat_usd.final_gather.irradiance_cache import Lookup
+from icheat_usd.final_gather.receiver_sets import Touched, mixtures_of
+from icheat_usd.final_gather.row_hemispheres import Collected, collect
+from icheat_usd.final_gather.row_stack import RowStack
+from icheat_usd.kernels import record_mixtures
+from icheat_usd.kernels import row_light as kernels
+from icheat_usd.kernels.row_sites import NEIGHBOURS
+from icheat_usd.materials import concatenate_points, take_points
+from icheat_usd.scene import F32, I64, Bool, SurfacePoints
+
+#: Decoded rows that are held at once; within the processor's caches, so that rays find their leaves fast.
+_DECODED_BYTES = 24 << 20
+
+
+class RowLight:
+    """Light of records' rows, found when a camera sample first asks for it.
+
+    Parameters
+    ----------
+    position, normal : (n_records, 3) float32
+    casters : Ends
+        The gather samples.
+    """
+
+    def __init__(self, gatherer: Gatherer, hemispheres: Hemispheres, position: F32, normal: F32, casters: Ends) -> None:
+        assert gatherer.solution is not None
+        self._casters = casters
+        self._gatherer, self._hemispheres, self._position, self._normal = gatherer, hemispheres, position, normal
+        self._stack = RowStack(gatherer.field)
+        self._rows = self._stack.rows
+        self._sent = gatherer.solution.b if gatherer.solution.sent is None else gatherer.solution.sent
+        self._sets: dict[bytes, int] = {}
+        self._slot = np.zeros((0, self._hemispheres.n), np.int32)
+        self._acts = np.zeros((0, self._stack.n_keys), np.uint8)
+        n = len(self._rows)
+        self._record, self._set = np.zeros(0, np.int64), np.zeros(0, np.int64)  # of each base
+        self._own_row, self._own_weight = (
+            np.zeros((0, n, NEIGHBOURS), np.int32),
+            np.zeros((0, n, NEIGHBOURS), np.float32),
+        )
+        self._bases = np.zeros((0, kernels.LANES), np.float32)
+        self._lists = kernels.Lists(np.zeros((0, n), np.int32), *(np.full(1 << 12, -1, np.int32) for _ in range(2)))
+        self._base_of, self._payload_of = (np.zeros(1 << 12, np.int32) for _ in range(2))
+        self._n = 0
+        self._sums = np.zeros((0, kernels.LANES), np.float32)
+
+    def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
+        """Change of irradiance at m receivers with records, (m, 3); `found` is of all points."""
+        where, which = receivers.where, receivers.which
+        mixed = mixtures_of(receivers)
+        number = np.array([self._set_of(is_in) for is_in in mixed.is_in], np.int32)
+        entry = number[mixed.entry]
+        active = self._stack.acting_payloads(self._acts)
+        rows, weights = self._stack.mixtures(receivers.ends())
+        asked = np.zeros((len(self._slot), self._hemispheres.n), np.uint8)
+        record_mixtures.mark_records(found.number, found.record, where, which, mixed.begin, entry, asked)
+        n_bases, n_sums = len(self._record), self._n
+        self._add_bases(asked.view(np.bool_) & (self._slot < 0))
+        own = np.arange(len(self._record) - n_bases)
+        self._list(
+            np.ones(len(own), np.int32),
+            self._record[n_bases:, None].astype(np.int32),
+            own,
+            own,
+            np.arange(len(own) + 1),
+            self._set[n_bases:].astype(np.int32),
+            active,
+            self._own_row[n_bases:],
+            self._own_weight[n_bases:],
+        )
+        places = found.number, found.record, where, which, mixed.begin, entry
+        self._list(*places, active, rows, weights)
+        self._sum(n_bases, n_sums)
+        out = np.empty((len(where), 3), np.float32)
+        kernels.mix_rows(
+            self._position,
+            self._normal,
+            points.position,
+            points.shading_normal,
+            *found[:3],
+            where,
+            which,
+            mixed.begin,
+            entry,
+            mixed.weight,
+            self._slot,
+            active,
+            self._lists,
+            rows,
+            weights,
+            self._bases,
+            self._sums,
+            out,
+        )
+        return out
+
+    # What is asked for
+
+    def _set_of(self, is_in: Bool) -> int:
+        name = is_in.tobytes()
+        if name not in self._sets:
+            self._sets[name] = len(self._sets)
+            self._slot = np.concatenate([self._slot, np.full((1, self._hemispheres.n), -1, np.int32)])
+            self._acts = np.concatenate([self._acts, self._stack.acting(is_in)[None]])
+        return self._sets[name]
+
+    def _add_bases(self, new: Bool) -> None:
+        """Bases of (n_sets, n_records)."""
+        one, record = np.nonzero(new)
+        n = len(record)
+        self._slot[one, record] = len(self._record) + np.arange(n, dtype=np.int32)
+        row = np.full((n, len(self._rows), NEIGHBOURS), -1, np.int32)
+        weight = np.zeros(row.shape, np.float32)
+        # Light is straight in the weights of one edit alone, so that they may count from 0.
+        several = self._stack.has_several(self._acts)[one]
+        if several.any():
+            at = take_points(self._record_points, record[several])
+            row[several], weight[several] = self._stack.mixtures(self._gatherer.field.receivers(at))
+            weight[several] *= self._stack.acting_payloads(self._acts[one[several]])[:, :, None]
+        self._record, self._set = np.concatenate([self._record, record]), np.concatenate([self._set, one])
+        self._own_row = np.concatenate([self._own_row, row])
+        self._own_weight = np.concatenate([self._own_weight, weight])
+        self._bases = np.concatenate([self._bases, np.zeros((n, kernels.LANES), np.float32)])
+        head = np.concatenate([self._lists.head, np.full((n, len(self._rows)), -1, np.int32)])
+        self._lists = self._lists._replace(head=head)
+
+    @property
+    def _record_points(self) -> SurfacePoints:
+        """Where records stand, in their order."""
+        parts, owners = [], []
+        seen = np.zeros(self._hemispheres.n, np.bool_)
+        for part in self._hemispheres.parts:
+            first = np.flatnonzero(~seen[part.owner])
+            seen[part.owner] = True
+            parts.append(take_points(part.points, first))
+            owners.append(part.owner[first])
+        return take_points(concatenate_points(*parts), np.argsort(np.concatenate(owners), kind="stable"))
+
+    def _list(self, *asked: Any) -> None:
+        """Enter sums that are not there yet; arguments of `kernels.list_sums` from `count` on."""
+        places, at = asked[:6], asked[6:]
+        done, n = 0, self._n
+        while True:
+            given: Any = (done, *places, self._slot, *at, self._lists, self._base_of, self._payload_of, n)
+            done, n = kernels.list_sums(*given)
+            if done == len(at[-1]):
+                break
+            more = np.full(max(len(self._base_of), 1 << 16), -1, np.int32)
+            following, row = (np.concatenate([column, more]) for column in self._lists[1:])
+            self._lists = kernels.Lists(self._lists.head, following, row)
+            self._base_of = np.concatenate([self._base_of, more])
+            self._payload_of = np.concatenate([self._payload_of, more])
+        self._n = n
+
+    # Sums
+
+    def _sum(self, first_base: int, first_sum: int) -> None:
+        """Sums from `first_sum` on, and light at the records of bases from `first_base` on."""
+        n = self._n - first_sum
+        self._sums = np.concatenate([self._sums, np.zeros((n, kernels.LANES), np.float32)])
+        base_of, payload_of = (
+            column[first_sum : self._n].astype(np.int64) for column in (self._base_of, self._payload_of)
+        )
+        row = self._lists.row[first_sum : self._n].astype(np.int64)
+        has_own = (self._own_weight != 0).any(axis=(1, 2))
+        is_new = has_own | self._stack.has_constants(self._acts)[self._set]
+        is_new[:first_base] = False
+        bases = np.union1d(base_of, np.flatnonzero(is_new))
+        if len(bases) == 0:
+            return
+        rays, stack = self._collect(np.unique(self._record[bases]))
+        used = np.unique(payload_of << 32 | row) >> 32
+        size = np.array([4 * rows.n_distinct * rows.n_cells for rows in self._rows])
+        n_chunks = 1 + int(size[used].sum()) // _DECODED_BYTES
+        # Neighbours share rows, and sums of one payload rays.
+        along = np.argsort(_along_curve(self._position[self._record[bases]]), kind="stable")
+        for some in np.array_split(bases[along], n_chunks):
+            position = np.full(len(self._record), -1, np.int64)
+            position[some] = np.arange(len(some))
+            mine = np.flatnonzero(position[base_of] >= 0)
+            mine = mine[np.lexsort((payload_of[mine], position[base_of[mine]]))]
+            own = self._own_row[some].astype(np.int64)
+            own[self._own_weight[some] == 0] = -1
+            decoded, at, own_at = self._decode(payload_of[mine], row[mine], own)
+            light = np.empty((len(some), kernels.LANES), np.float32)
+            sums = np.empty((len(mine), kernels.LANES), np.float32)
+            first = self._hemispheres.parts[0].rays
+            kernels.row_sums(
+                rays.table,
+                stack,
+                self._sent,
+                not self._gatherer.is_part,
+                first.seed,
+                first.n_theta,
+                first.n_phi,
+                rays.order,
+                rays.range_of(self._record[some]),
+                self._acts[self._set[some]],
+                is_new[some].astype(np.uint8),
+                own_at,
+                self._own_weight[some],
+                np.searchsorted(position[base_of[mine]], np.arange(len(some) + 1)),
+                payload_of[mine],
+                at,
+                decoded,
+                light,
+                sums,
+            )
+            self._sums[first_sum + mine] = sums
+            self._bases[some[is_new[some]]] = light[is_new[some]]
+        new = np.flatnonzero(has_own & is_new)
+        kernels.take_own(self._lists, new, self._own_row[new], self._own_weight[new], self._sums, self._bases)
+
+    def _decode(self, payload: I64, row: I64, own: I64) -> tuple[F32, I64, I64]:
+        """Rows, one after another, and where those of sums and of records (n, n_payloads, 4) begin; -1 for none."""
+        parts, begin = [np.zeros(0, np.float32)], 0
+        at, own_at = np.zeros(len(row), np.int64), np.full(own.shape, -1, np.int64)
+        for one, rows in enumerate(self._rows):
+            mine, held = payload == one, own[:, one] >= 0
+            used, which = np.unique(np.concatenate([row[mine], own[:, one][held]]), return_inverse=True)
+            parts.append(rows.decode(used).reshape(-1))
+            first = begin + which.reshape(-1) * (rows.n_distinct * rows.n_cells)
+            at[mine] = first[: int(mine.sum())]
+            own_at[:, one][held] = first[int(mine.sum()) :]
+            begin += len(parts[-1])
+        return np.concatenate(parts), at, own_at
+
+    def _collect(self, records: I64) -> tuple[Collected, kernels.Stack]:
+        """Hemispheres of some records, and the edits at the ends of their rays."""
+        field, solution = self._gatherer.field, self._gatherer.solution
+        assert solution is not None
+        snapshot = self._gatherer.snapshot
+        varied = self._stack.varied(snapshot.n_instances)
+        rays = collect(self._hemispheres, records, snapshot, solution.gather, varied)
+        casters = [self._casters]
+        if rays.strangers is not None:
+            casters.append(field.casters(rays.strangers))
+        return rays, self._stack.table(casters)
+
+
+def _along_curve(position: F32) -> I64:
+    """Order along a curve that fills space, 10 bits an axis (Morton)."""
+    low = position.min(axis=0)
+    extent = max(float((position.max(axis=0) - low).max()), 1e-30)
+    grid = ((position - low) * (1023.0 / extent)).astype(np.int64)
+    code = np.zeros(len(position), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= (grid[:, axis] >> bit & 1) << 3 * bit + axis
+    return code
