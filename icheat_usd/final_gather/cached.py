@@ -39,13 +39,24 @@ class CachedGather:
         With rays, if the stack has edits.
     glossy_rays : int
         Per point with a specular lobe.
+    samples_per_pixel : int
+        Of pixels with camera samples that no record reaches; these share the rays that a record has.
     is_kept : bool
         Whether to keep `samples`, what was found at every call of `light`, for other stacks.
     """
 
-    def __init__(self, gatherer: Gatherer, cache: IrradianceCache, glossy_rays: int, *, is_kept: bool = False) -> None:
+    def __init__(
+        self,
+        gatherer: Gatherer,
+        cache: IrradianceCache,
+        glossy_rays: int,
+        samples_per_pixel: int,
+        *,
+        is_kept: bool = False,
+    ) -> None:
         self._gatherer, self.cache, self._glossy_rays = gatherer, cache, glossy_rays
         self._is_kept = is_kept
+        self._own_rings = max(4, 4 * round(cache.settings.n_theta / (4 * np.sqrt(samples_per_pixel))))
         self.samples: list[Sampled] = []
         self._parts = CachedParts(gatherer.parts, cache)
         self.hemispheres = hemispheres_of(cache)
@@ -71,7 +82,7 @@ class CachedGather:
         # What the coarser look at the scene has missed, less than a pixel wide, is gathered where it is.
         alone, own_rays = np.flatnonzero(found.number == 0), None
         if len(alone):
-            own_rays = self.cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone])
+            own_rays = self.cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone], self._own_rings)
             irradiance[alone] = np.pi * own_rays.radiance(self.cache.cells).mean(axis=1)
         base = (points.albedo * (irradiance * _INVERSE_PI)).astype(np.float32, copy=False)
         shiny = specular_lobe(self._gatherer, points, to_eye, draws, self._glossy_rays, seed)

@@ -237,7 +237,9 @@ def _cached(
     placed = overture(cache, places, pixels, width, progress)
     records = CacheRecords(placed.pixel, cache.table.reach / placed.extent, placed.spacing)
     camera.sharpen(light_edges(cache, places, pixels, width, width * height))
-    return CachedGather(gatherer, cache, settings.glossy_rays, is_kept=is_kept), records
+    # Pixels that records miss are among those with more samples.
+    n_samples = settings.samples_per_pixel + settings.edge_samples
+    return CachedGather(gatherer, cache, settings.glossy_rays, n_samples, is_kept=is_kept), records
 
 
 def _places(snapshot: SceneSnapshot, band: Band) -> Places:

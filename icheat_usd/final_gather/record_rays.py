@@ -100,9 +100,10 @@ class HemisphereTracer:
         self._n_theta, self._n_phi, self._seed = n_theta, n_phi, seed
         self._route = routed_triangles(snapshot)
 
-    def trace(self, points: SurfacePoints, stream: I64) -> RecordRays:
-        """Rays from some points; `stream` (n,) numbers their random sequences."""
-        return self._measure_near(self._trace(points, stream))
+    def trace(self, points: SurfacePoints, stream: I64, n_theta: int | None = None) -> RecordRays:
+        """Rays from some points; `stream` (n,) numbers their random sequences. Other rings than usual are `n_theta`."""
+        n_phi = self._n_phi if n_theta is None else 3 * n_theta
+        return self._measure_near(self._trace(points, stream, n_theta or self._n_theta, n_phi))
 
     def _measure_near(self, rays: RecordRays) -> RecordRays:
         """Light of near hits, as what it is over the light of their cells: lights have the same shares in both."""
@@ -137,11 +138,11 @@ class HemisphereTracer:
         order = np.argsort(adjusted, kind="stable")
         return rays._replace(adjusted=adjusted[order], throughput=np.concatenate([rays.throughput, throughput])[order])
 
-    def _trace(self, points: SurfacePoints, stream: I64) -> RecordRays:
-        n, n_rays = len(stream), self._n_theta * self._n_phi
+    def _trace(self, points: SurfacePoints, stream: I64, n_theta: int, n_phi: int) -> RecordRays:
+        n, n_rays = len(stream), n_theta * n_phi
         rays = RecordRays(
-            self._n_theta,
-            self._n_phi,
+            n_theta,
+            n_phi,
             self._seed,
             stream,
             spawn_points(self._snapshot, points, points.normal),
@@ -174,8 +175,8 @@ class HemisphereTracer:
             np.require(points.normal, np.float32, ["C", "W"]),
             stream,
             self._seed,
-            self._n_theta,
-            self._n_phi,
+            n_theta,
+            n_phi,
             rays.cell,
             rays.distance,
             rays.instance,

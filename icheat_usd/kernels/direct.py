@@ -8,7 +8,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from icheat_usd.kernels._jit import parallel_kernel
+from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.environment import F32, F64, Table
 from icheat_usd.kernels.guide import (
     COSINE_SHARE,
@@ -20,11 +20,51 @@ from icheat_usd.kernels.guide import (
 )
 from icheat_usd.kernels.lights import hit_shape, light_shape, mesh_pdf, sample_mesh, sample_shape
 from icheat_usd.kernels.random import hash_combine, sobol_pair
+from icheat_usd.kernels.vector import row3
 
 _DOME = 5
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
+
+
+@kernel
+def sequence_of(draws, i, light, seed):  # type: ignore[no-untyped-def]
+    """Sequence of random numbers of point i's rays to a light."""
+    return hash_combine(hash_combine(hash_combine(seed, 0x11), draws[i, 0]), light)
+
+
+@kernel
+def analytic_ray(  # type: ignore[no-untyped-def]
+    kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, bands, columns, guided, place, normal,
+    shading_normal, u1, u2,
+):  # fmt: skip
+    """Direction, distance, density and relative radiance of a ray to a light that is no mesh.
+
+    `kind` to `image` as of `light_shape`; `guided` is the guide's row, or -1. The density is 0 where the ray brings
+    nothing: it misses the light, or leaves below either horizon.
+    """
+    px, py, pz = place
+    gx, gy, gz = normal
+    nx, ny, nz = shading_normal
+    v1, v2 = float(u1), float(u2)
+    factor = 1.0
+    if guided >= 0 and image[0] >= 0:
+        v1, v2, factor = warp(bands, columns, guided, v1, v2)
+    elif guided >= 0:
+        v1 /= COSINE_SHARE
+    wx, wy, wz, t, p, r, g, b = sample_shape(
+        kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, px, py, pz, nx, ny, nz, min(v1, 1.0), v2
+    )
+    p *= factor
+    if guided >= 0 and image[0] < 0:
+        if v1 >= 1.0:
+            v1, v2, factor = warp(bands, columns, guided, (u1 - COSINE_SHARE) / (1.0 - COSINE_SHARE), float(u2))
+            wx, wy, wz = sphere_direction(v1, v2)
+        p = plain_dome_pdf(bands, columns, guided, nx, ny, nz, wx, wy, wz)
+    if p > 0.0 and (wx * nx + wy * ny + wz * nz <= 0.0 or wx * gx + wy * gy + wz * gz <= 0.0):
+        p = 0.0
+    return wx, wy, wz, t, p, r, g, b
 
 
 @parallel_kernel
@@ -60,53 +100,24 @@ def fill_analytic(
     for i in prange(position.shape[0]):
         if instance[i] < 0:
             continue
-        sequence = hash_combine(hash_combine(hash_combine(seed, 0x11), draws[i, 0]), light)
-        px, py, pz = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
-        gx, gy, gz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-        nx, ny, nz = float(shading_normal[i, 0]), float(shading_normal[i, 1]), float(shading_normal[i, 2])
+        sequence = sequence_of(draws, i, light, seed)
+        place, upwards, about = row3(position, i), row3(normal, i), row3(shading_normal, i)
         guided = -1
         if kind == _DOME:
-            guided = find_row(axis, split, child, rows, light, px, py, pz, nx, ny, nz)
+            guided = find_row(
+                axis, split, child, rows, light, place[0], place[1], place[2], about[0], about[1], about[2]
+            )
         for k in range(n_samples):
             u1, u2 = sobol_pair(draws[i, 1] + k, sequence)
-            v1, v2 = float(u1), float(u2)
-            factor = 1.0
-            if guided >= 0 and image[0] >= 0:
-                v1, v2, factor = warp(bands, columns, guided, v1, v2)
-            elif guided >= 0:
-                v1 /= COSINE_SHARE
-            wx, wy, wz, t, p, r, g, b = sample_shape(
-                kind,
-                m,
-                inverse,
-                size,
-                image,
-                texels,
-                rows_cdf,
-                columns_cdf,
-                px,
-                py,
-                pz,
-                nx,
-                ny,
-                nz,
-                min(v1, 1.0),
-                v2,
-            )
-            p *= factor
-            if guided >= 0 and image[0] < 0:
-                if v1 >= 1.0:
-                    v1, v2, factor = warp(bands, columns, guided, (u1 - COSINE_SHARE) / (1.0 - COSINE_SHARE), float(u2))
-                    wx, wy, wz = sphere_direction(v1, v2)
-                p = plain_dome_pdf(bands, columns, guided, nx, ny, nz, wx, wy, wz)
+            wx, wy, wz, t, p, r, g, b = analytic_ray(
+                kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, bands, columns, guided, place, upwards,
+                about, u1, u2,
+            )  # fmt: skip
             if p <= 0.0:
-                continue
-            shading_cosine = wx * nx + wy * ny + wz * nz
-            if shading_cosine <= 0.0 or wx * gx + wy * gy + wz * gz <= 0.0:
                 continue
             weight = 1.0 / (p * n_samples)
             if cosine:
-                weight *= shading_cosine
+                weight *= wx * about[0] + wy * about[1] + wz * about[2]
             row = i * n_samples + k
             direction[row, 0] = wx
             direction[row, 1] = wy

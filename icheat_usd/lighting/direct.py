@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels.direct import fill_analytic, fill_mesh
+from icheat_usd.kernels.shadowed import Weights, add_shadowed
 from icheat_usd.lighting.controls import lit_instances, shape, tracer_for
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.lighting.specular_rays import STOP_SHORT, add_rays, add_specular_rays, is_delta, power_heuristic
@@ -16,6 +17,7 @@ from icheat_usd.materials import evaluate, evaluate_specular, is_glossy, points_
 from icheat_usd.materials.surface import nonzero_rows
 from icheat_usd.scene import F32, I64, LightControls, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, spawn_points, transmittance
+from icheat_usd.tracing.paths import is_see_through
 
 # Rays in flight: enough to keep every thread busy, few enough for some tens of megabytes.
 _RAYS = 1 << 18
@@ -186,6 +188,8 @@ def add_shadow_rays(
         Lowered and raised to the least and the largest irradiance that a ray brings, of points that face the light.
     """
     controls, to_light = snapshot.controls(light), tracer_for(snapshot, tracer, light)
+    if _add_in_one_pass(snapshot, to_light, sampler, points, to_eye, light, draws, seed, count, shares, out, extremes):
+        return
     step = max(1, _RAYS // count)
     n = len(points.instance)
     for first in range(0, n, step):
@@ -206,6 +210,57 @@ def add_shadow_rays(
         if extremes is not None and len(rays.point):
             _note_extremes(chunk, rays, passed, extremes[part])
         add_rays(value * passed, rays.point, out[part])
+
+
+def _add_in_one_pass(
+    snapshot: SceneSnapshot,
+    to_light: Tracer,
+    sampler: LightSampler,
+    points: SurfacePoints,
+    to_eye: F32 | None,
+    light: int,
+    draws: I64,
+    seed: int,
+    count: int,
+    shares: tuple[int, int],
+    out: F32,
+    extremes: F32 | None,
+) -> bool:
+    """`add_shadow_rays` of a light without a mesh or shaping, in a scene that no light gets through, if it is that."""
+    controls, trace = snapshot.controls(light), to_light.compiled_shadows()
+    lights = snapshot.lights
+    if (
+        trace is None
+        or lights.kind[light] == LightKind.MESH
+        or controls.shaping is not None
+        or is_see_through(snapshot)
+    ):
+        return False
+    points = _part(points, slice(None))
+    n_specular = 0.0 if is_delta(snapshot, light) else float(shares[1])
+    weights = Weights(
+        float(shares[0]), n_specular, float(controls.diffuse), float(controls.specular), float(STOP_SHORT)
+    )
+    eye = np.empty((0, 3), np.float32) if to_eye is None else np.require(to_eye, np.float32, ["C", "W"])
+    add_shadowed(
+        trace,
+        lights,
+        snapshot.textures,
+        sampler.tables,
+        sampler.guide,
+        light,
+        points,
+        lit_instances(snapshot, light, points.instance),
+        spawn_points(snapshot, points, points.normal),
+        eye,
+        draws,
+        count,
+        seed & 0xFFFFFFFF,
+        weights,
+        out,
+        np.empty((0, 2), np.float32) if extremes is None else extremes,
+    )
+    return True
 
 
 def _note_extremes(chunk: SurfacePoints, rays: _ShadowRays, passed: F32, extremes: F32) -> None:

@@ -269,6 +269,12 @@ class EmbreeTracer:
             self._instance_mesh,
         )
 
+    def compiled_shadows(self) -> TraceTable:
+        """See `Tracer.compiled_shadows`."""
+        table = self.compiled()
+        # Shadow rays of neighbours are much alike.
+        return table._replace(function=_address("rtcOccluded16" if table.packets else "rtcOccluded1"))
+
     def address_of(self, function: str) -> tuple[int, int]:
         """Addresses of one of Embree's functions and of the scene, for compiled loops that make their own rays."""
         self._require_open()

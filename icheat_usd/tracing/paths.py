@@ -34,6 +34,12 @@ def passing_materials(materials: Materials) -> Bool:
     )
 
 
+def is_see_through(snapshot: SceneSnapshot) -> bool:
+    """Whether any surface may let light straight through."""
+    passing = passing_materials(snapshot.materials)
+    return bool(passing.any() and passing[snapshot.geometry.material].any())
+
+
 def first_surfaces(
     snapshot: SceneSnapshot,
     tracer: Tracer,
@@ -153,11 +159,11 @@ def transmittance(
 
     origins, directions, limits = checked_rays(origins, directions, t_max)
     n = len(origins)
-    passing = passing_materials(snapshot.materials)
-    if not passing[np.unique(snapshot.geometry.material)].any():
+    if not is_see_through(snapshot):
         clear = ~tracer.occluded(origins, directions, limits)
         return np.repeat(clear.astype(np.float32)[:, None], 3, 1)
 
+    passing = passing_materials(snapshot.materials)
     left = np.ones(n, np.float32)
     ray = np.arange(n)
     limits = np.broadcast_to(limits, n).astype(np.float32)

@@ -40,6 +40,10 @@ class Tracer(Protocol):
         """What compiled loops need to trace rays by themselves, while this tracer is open; None if they cannot."""
         ...
 
+    def compiled_shadows(self) -> TraceTable | None:
+        """The same for rays that ask whether anything is hit."""
+        ...
+
     def close(self) -> None:
         """Release what the tracer holds; do not trace afterwards."""
         ...

@@ -50,6 +50,9 @@ class ReferenceTracer:
     def compiled(self) -> None:
         """See `Tracer.compiled`."""
 
+    def compiled_shadows(self) -> None:
+        """See `Tracer.compiled_shadows`."""
+
     def intersect(self, origins: F32, directions: F32, t_max: F32 | float | None = None) -> Hits:
         """See `Tracer.intersect`."""
         origins, directions, t_max = checked_rays(origins, directions, t_max)
