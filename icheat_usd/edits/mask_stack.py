@@ -30,6 +30,11 @@ def is_of_masks(field: EditField) -> bool:
     )
 
 
+def looks_at_hits(field: EditField) -> bool:
+    """Whether it matters where on an instance a caster lies."""
+    return not is_of_masks(field) or any(casters.mask is not None for bound in field.edits for casters in bound.casters)
+
+
 def mask_stack(field: EditField, *, with_emission: bool) -> StackTable:
     """What each row of a field makes of a pair, if `is_of_masks`.
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.edits.field import EditField
+from icheat_usd.edits.mask_stack import looks_at_hits
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.errors import EditError
 from icheat_usd.final_gather.cached import CachedGather
@@ -227,7 +228,8 @@ def _cached(
         near = NearLight(snapshot, gatherer.tracer, gatherer.sampler, gather, total, n_paths, own_seed)
     tracer = HemisphereTracer(snapshot, gatherer.tracer, gather, n_theta, n_phi, own_seed, near)
     keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.acts_on_views_alone
-    cache = IrradianceCache(tracer, cells, settings.cache, is_kept=keeps_rays)
+    keeps_hits = is_kept or bool(gatherer.parts) or looks_at_hits(gatherer.field)
+    cache = IrradianceCache(tracer, cells, settings.cache, keeps_rays, keeps_hits)
     found, pixel = [], []
     for band in camera.first():
         found.append(_places(snapshot, band))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icheat_usd.final_gather.record_rays import HemisphereTracer, RecordRays, concatenate_rays
+from icheat_usd.final_gather.record_rays import HemisphereTracer, RecordRays, concatenate_rays, without_hits
 from icheat_usd.kernels import irradiance_cache as kernels
 from icheat_usd.kernels import record_sums
 from icheat_usd.materials import concatenate_points, take_points
@@ -129,6 +129,7 @@ class IrradianceCache:
     cells: F32
     settings: CacheSettings
     is_kept: bool = False  #: whether rays are kept, so that edits can look at them
+    keeps_hits: bool = True  #: and where on their surfaces they end, so that edits can look at painted casters
     table: kernels.RecordTable = field(init=False)
     values: RecordValues = field(init=False)
     shrink: F32 = field(default_factory=lambda: np.empty(0, np.float32))  #: (n,) what `by_move` was multiplied with
@@ -299,7 +300,7 @@ class IrradianceCache:
 
     def _keep(self, rays: RecordRays, points: SurfacePoints, record: I64) -> None:
         if self.is_kept:
-            self._rays.append(rays)
+            self._rays.append(rays if self.keeps_hits else without_hits(rays))
             self._points.append(points)
             self._owner.append(record)
 

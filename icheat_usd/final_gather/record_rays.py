@@ -219,6 +219,12 @@ class HemisphereTracer:
         return self._behind(rays, np.flatnonzero((hits.instance >= 0) & routed))
 
 
+def without_hits(rays: RecordRays) -> RecordRays:
+    """The same without the places on their surfaces, half of what they hold: new memory costs as much as the rays."""
+    n_rays = rays.n_rays
+    return rays._replace(triangle=np.empty((0, n_rays), np.int32), uv=np.empty((0, n_rays, 2), np.float32))
+
+
 def concatenate_rays(parts: list[RecordRays]) -> RecordRays:
     """Rays of all parts, one after another; all of one tracer."""
     first = parts[0]

@@ -55,6 +55,12 @@ def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: 
     """
     m, n = n_theta, n_phi
     close = np.empty(m * n, np.float32)
+    slope, low, width = np.empty(m), np.zeros(m + 1), np.empty(m)
+    for j in range(m):
+        u = (j + 0.5) / m
+        slope[j] = np.pi / (m * n) * factor * np.sqrt(u / (1.0 - u))
+        low[j] = (1.0 - j / m) * np.sqrt(j / m) * (2.0 * np.pi / n) * factor
+        width[j] = factor * (np.sqrt((j + 1) / m) - np.sqrt(j / m))
     for ray in range(m * n):
         close[ray] = np.float32(1.0) / max(distance[r, ray], _TOUCHING)
     for k in range(n):
@@ -65,18 +71,13 @@ def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: 
         next_across, next_along = np.cos(next_edge), np.sin(next_edge)
         before, after = (k - 1 if k > 0 else n - 1), (k + 1 if k + 1 < n else 0)
         for j in range(m):
-            ray, u = j * n + k, (j + 0.5) / m
-            slope = np.pi / (m * n) * factor * np.sqrt(u / (1.0 - u))
-            width = factor * (np.sqrt((j + 1) / m) - np.sqrt(j / m))
-            step = 0.0
-            if j > 0:
-                step += (1.0 - j / m) * np.sqrt(j / m) * max(close[ray], close[ray - n])
-            if j + 1 < m:
-                step -= (1.0 - (j + 1) / m) * np.sqrt((j + 1) / m) * max(close[ray], close[ray + n])
-            step *= factor * (2.0 * np.pi / n)
-            here = width * max(close[ray], close[j * n + before])
-            there = width * max(close[ray], close[j * n + after])
-            out[ray, 0], out[ray, 1] = -along * slope, across * slope
+            ray = j * n + k
+            # Nothing is inside of the first ring, or outside of the last.
+            step = low[j] * max(close[ray], close[ray - n if j > 0 else ray])
+            step -= low[j + 1] * max(close[ray], close[ray + n if j + 1 < m else ray])
+            here = width[j] * max(close[ray], close[j * n + before])
+            there = width[j] * max(close[ray], close[j * n + after])
+            out[ray, 0], out[ray, 1] = -along * slope[j], across * slope[j]
             out[ray, 2] = across * step - edge_along * here + next_along * there
             out[ray, 3] = along * step + edge_across * here - next_across * there
 

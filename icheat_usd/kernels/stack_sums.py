@@ -130,13 +130,23 @@ def _hold(i, first, end, casters, stack, slots, lines):  # type: ignore[no-untyp
 
 
 @kernel
-def _composed(own_0, is_last, base, n, weight, start, past_0, factor_0):  # type: ignore[no-untyped-def]
+def _has_shifts(stack):  # type: ignore[no-untyped-def]
+    """Whether an edit adds anything to what it does not multiply."""
+    for value in stack.shift.reshape(-1):
+        if value != np.float32(0.0):
+            return True
+    return False
+
+
+@kernel
+def _composed(own_0, shifts, is_last, base, n, weight, start, past_0, factor_0):  # type: ignore[no-untyped-def]
     """Change of a block of S or E by `n` edits, whose lines are at an address; what derivatives need goes to others."""
     one = color_of(np.float32(1.0), np.float32(1.0), np.float32(1.0))
     x, a, b = start, one, black()
     for q in range(n):
         a = scale_add(load_color(own_0 + 32 * q), weight[q], a)
-        b = scale_add(load_color(own_0 + 32 * q + 16), weight[q], b)
+        if shifts:
+            b = scale_add(load_color(own_0 + 32 * q + 16), weight[q], b)
         store_color(past_0 + 16 * q, x)
         store_color(factor_0 + 16 * q, a)
         if is_last[base + q]:
@@ -192,6 +202,7 @@ def _of_casters(r, begin, caster, light, casters, stack, slots, values, derivati
     place, weight = slots.place.reshape(-1), lines.at_hit
     past_0, factor_0 = address_of(lines.past), address_of(lines.factor)
     own_0, line_0 = address_of(lines.own), address_of(lines.line)
+    shifts = _has_shifts(stack)
     light_0, values_0, start_0 = address_of(light), address_of(values), address_of(stack.start)
     derivative_0 = address_of(derivative)
     for e in range(begin[r], begin[r + 1]):
@@ -205,7 +216,7 @@ def _of_casters(r, begin, caster, light, casters, stack, slots, values, derivati
             for block in range(n_blocks):
                 own = own_0 + 32 * n_rows * ((held * (end - first) + s - first) * n_blocks + block)
                 start = load_color(start_0 + 16 * block)
-                change = _composed(own, is_last, base, n, weight, start, past_0, factor_0)
+                change = _composed(own, shifts, is_last, base, n, weight, start, past_0, factor_0)
                 at = light_0 + 16 * N_VALUES * (e * light.shape[1] + block)
                 for v in range(N_VALUES):
                     to = values_0 + 16 * (N_VALUES * s + v)
@@ -320,6 +331,7 @@ def _of_rays(  # type: ignore[no-untyped-def]
     place, pattern, derived = slots.place.reshape(-1), slots.pattern, slots.derived
     past_0, factor_0 = address_of(lines.past), address_of(lines.factor)
     own_0, line_0 = address_of(lines.own), address_of(lines.line)
+    shifts = _has_shifts(stack)
     sums = np.zeros((n_slots, 5, 4), np.float32)
     sums_0, sent_0, throughput_0 = address_of(sums), address_of(sent), address_of(rays.throughput)
     start_0, derivative_0 = address_of(stack.start), address_of(derivative)
@@ -375,7 +387,7 @@ def _of_rays(  # type: ignore[no-untyped-def]
             start = load_color(start_0 + 16 * block)
             for s in range(n_slots):
                 own = own_0 + 32 * n_rows * ((held * n_slots + s) * n_blocks + block)
-                change = _composed(own, is_last, base, n, weight, start, past_0, factor_0)
+                change = _composed(own, shifts, is_last, base, n, weight, start, past_0, factor_0)
                 add_weighted(sums_0 + 80 * s, color_product(change, light), share, weights, ray)
                 if derived[first + s] < derived[first + s + 1]:
                     _derive(

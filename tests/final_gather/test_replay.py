@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.edits.model import Edit, KeyedPayload, Payload
+from icheat_usd.edits.model import Edit, KeyedPayload, Payload, SurfaceMask
 from icheat_usd.final_gather import GatherSettings, final_gather, masked_records
 from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, WHITE, painted, previews, soft
 from tests.pipeline import TINY, select
@@ -80,10 +80,43 @@ def test_light_under_masks_is_the_light_of_the_rays(name, change, tolerance, mon
     """With masks for every place, and with those of places near it; and edited ray by ray."""
     monkeypatch.setattr(masked_records, "MOST_CHANGE", change)
     fast = rendered(*STACKS[name]).indirect_edited
-    monkeypatch.setattr("icheat_usd.final_gather.edited_records.is_of_masks", lambda field: False)
+    for module in ("final_gather.edited_records", "edits.mask_stack"):
+        monkeypatch.setattr(f"icheat_usd.{module}.is_of_masks", lambda field: False)
     slow = rendered(*STACKS[name]).indirect_edited
     assert (fast != slow).any()
     np.testing.assert_allclose(fast, slow, rtol=tolerance, atol=1e-6)
+
+
+def overlapping_brushes(n: int) -> tuple[Edit, ...]:
+    """From soft places on a side wall to soft places on the back wall, all over each other."""
+    edits = []
+    for i in range(n):
+        masks = {"receiver_mask": smooth("/back", i), "caster_mask": smooth("/red", n + i)}
+        parameters = {"color": tuple(np.random.default_rng(i).uniform(0.6, 1.6, 3).tolist())}
+        keys = (KeyedPayload(Payload("scale", parameters, **masks), 1.0),)
+        edits.append(Edit(f"/brush{i}", "scale", parameters, select("/back"), select("/red"), keys=keys))
+    return tuple(edits)
+
+
+def smooth(path: str, seed: int) -> SurfaceMask:
+    """A mask that falls from one side of each face to the other."""
+    mask = soft(path, seed)
+    a, b, c = np.random.default_rng(seed).uniform(0, 1, 3)
+    x = np.linspace(0, 1, 4, dtype=np.float32)
+    texels = np.clip(c + (a - 0.5) * x[:, None] + (b - 0.5) * x[None, :], 0, 1).astype(np.float32)
+    return SurfaceMask(mask.surfaces, np.broadcast_to(texels, mask.texels.shape).copy())
+
+
+def test_brushes_that_overlap_are_those_of_places_with_masks_of_their_own(monkeypatch):
+    """Twelve soft masks a receiver, and twelve a caster: more than sets of edits could be mixed for."""
+    edits = overlapping_brushes(12)
+    near = rendered(*edits)
+    monkeypatch.setattr(masked_records, "MOST_CHANGE", 0.0)
+    exact = rendered(*edits)
+    changed = np.abs(exact.indirect_edited - exact.indirect)
+    assert changed.max() > 0.05 * exact.indirect.max()
+    assert (near.indirect_edited != exact.indirect_edited).any()
+    np.testing.assert_allclose(near.indirect_edited, exact.indirect_edited, rtol=2e-3)
 
 
 def test_a_replay_has_the_same_bits_on_one_thread_and_on_two():
