@@ -95,8 +95,12 @@ class MaskedRecords:
         if not self._patterns.acts.any():
             return out
         masks = np.ascontiguousarray(receivers.columns.T)
-        slot = self._choose(found, where, which, masks)
         number = np.take(found.number, where).astype(np.int64)
+        first = np.cumsum(number) - number
+        if self._bend.any():
+            slot = self._choose(found, where, which, masks)
+        else:
+            slot = self._choose_by_pattern(found, where, which, masks, first)
         slots, soft_begin, soft_row = self._slots, *self._patterns.soft_rows()
         kernels.mix_slots(
             cache.table.position,
@@ -115,7 +119,7 @@ class MaskedRecords:
             where,
             which,
             masks,
-            np.cumsum(number) - number,
+            first,
             out,
         )
         return out
@@ -171,19 +175,35 @@ class MaskedRecords:
             self._add(record, np.where(is_own[new, None], own_masks[record], masks[column]), pattern[column])
         return slot
 
+    def _choose_by_pattern(self, found: Lookup, where: I64, which: I64, masks: F32, first: I64) -> I64:
+        """`_choose` where masks are the same all over a pattern."""
+        pattern = self._patterns.of(masks)
+        at_places = np.take(pattern, which)
+        needed = np.zeros((self._cache.n, int(pattern.max(initial=0)) + 1), np.uint8)
+        kernels.mark_records(found.number, found.record, where, at_places, needed)
+        known = np.full(
+            (self._cache.n, max(needed.shape[1], int(self._slots.pattern.max(initial=0)) + 1)), -1, np.int64
+        )
+        known[self._slots.record, self._slots.pattern] = np.arange(len(self._slots.record))
+        record, new = np.nonzero(needed.view(np.bool_) & (known[:, : needed.shape[1]] < 0))
+        if len(record):
+            known[record, new] = len(self._slots.record) + np.arange(len(record))
+            column = np.zeros(needed.shape[1], np.int64)
+            column[pattern] = np.arange(len(pattern))
+            self._add(record, masks[column[new]], new.astype(np.int32))
+        slot = np.empty(int(found.number[where].sum()), np.int64)
+        kernels.slots_of_pairs(found.number, found.record, where, at_places, known, first, slot)
+        return slot
+
     def _own_masks(self) -> tuple[F32, I32]:
         """Masks at the records' own places, and their patterns."""
         if self._own is None:
             parts = self._hemispheres.parts
-            n, n_rows = self._cache.n, self._field.n_rows
-            if not self._bend.any():  # Nobody looks at them.
-                self._own = np.zeros((n, n_rows), np.float32), np.full(n, -1, np.int32)
-            else:
-                owner = np.concatenate([part.owner for part in parts])
-                _, first = np.unique(owner, return_index=True)
-                points = take_points(concatenate_points(*(part.points for part in parts)), first)
-                masks = np.ascontiguousarray(self._field.receiver_masks(points).T)
-                self._own = masks, self._patterns.of(masks)
+            owner = np.concatenate([part.owner for part in parts])
+            _, first = np.unique(owner, return_index=True)
+            points = take_points(concatenate_points(*(part.points for part in parts)), first)
+            masks = np.ascontiguousarray(self._field.receiver_masks(points).T)
+            self._own = masks, self._patterns.of(masks)
         return self._own
 
     def _add(self, record: I64, masks: F32, pattern: I32) -> None:

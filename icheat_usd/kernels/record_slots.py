@@ -66,6 +66,33 @@ def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-unt
 
 
 @kernel
+def mark_records(count, record, where, pattern, needed):  # type: ignore[no-untyped-def]
+    """Which records are asked in which patterns.
+
+    Parameters
+    ----------
+    count, record, where : as of `list_pairs`
+    pattern : (m,) int32
+        Of each place.
+    needed : (n_records, n_patterns) uint8, out
+        Set to 1.
+    """
+    for q in range(len(where)):
+        p = where[q]
+        for k in range(count[p]):
+            needed[record[p, k], pattern[q]] = 1
+
+
+@parallel_kernel
+def slots_of_pairs(count, record, where, pattern, known, first, slot):  # type: ignore[no-untyped-def]
+    """Slot of every pair of a place and a record, by ``known[record, pattern]``; `first` as of `mix_slots`."""
+    for q in prange(len(where)):
+        p = where[q]
+        for k in range(count[p]):
+            slot[first[q] + k] = known[record[p, k], pattern[q]]
+
+
+@kernel
 def _difference(a, i, b, j, bend, sums):  # type: ignore[no-untyped-def]
     """How differently two rows of masks act: sum of relative changes, and what each two of them make together."""
     n = len(bend)
