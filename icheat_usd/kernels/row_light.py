@@ -358,7 +358,7 @@ def _derivatives(  # type: ignore[no-untyped-def]
     """Light of each ray by one unit more of each edit's S - 1 and E; what edits change of it is added to `total`."""
     n_groups = len(sent)
     a = hemispheres.adjusted_begin[h]
-    change = np.empty(6, np.float32)
+    change, met = np.empty(6, np.float32), np.empty(len(acts), np.bool_)
     for ray in range(hemispheres.cell.shape[1]):
         a = _arriving(h, ray, a, hemispheres, sent, emits, light)
         if hemispheres.cell[h, ray] < 0:
@@ -368,10 +368,16 @@ def _derivatives(  # type: ignore[no-untyped-def]
                 scale[g, c] = np.float32(1.0)
             scale[n_groups, c] = np.float32(0.0)
         caster = hemispheres.caster[h, ray]
+        n_met = 0
         for e in range(len(acts)):
-            if acts[e]:
+            # Edits whose masks are 0 here carry all that they meet.
+            met[e] = acts[e] != 0 and _is_masked(b, e, caster, stack, is_in)
+            if met[e]:
                 kept = _change_of(b, e, caster, stack, is_in, own_at, own_weight, decoded, change)
                 _lay(e, stack, kept, change, scale, state)
+                n_met += 1
+        if n_met == 0:
+            continue
         for c in range(3):
             changed = scale[n_groups, c] * light[n_groups, c]
             for g in range(n_groups):
@@ -381,14 +387,22 @@ def _derivatives(  # type: ignore[no-untyped-def]
         # From the strongest edit back: `light` becomes what a unit of scale, left by the edits so far, comes to.
         for step in range(len(acts)):
             e = len(acts) - 1 - step
-            if acts[e]:
+            if met[e]:
                 _back(e, ray, stack, state, light, by_scale, by_emission)
+
+
+@kernel
+def _is_masked(b, e, caster, stack, is_in):  # type: ignore[no-untyped-def]
+    for q in range(stack.first_key[e], stack.first_key[e + 1]):
+        if is_in[b, q] and stack.mask[q, caster] != np.float32(0.0):
+            return True
+    return False
 
 
 @kernel
 def _change_of(b, e, caster, stack, is_in, own_at, own_weight, decoded, change):  # type: ignore[no-untyped-def]
     """S - 1 and E of one edit and pair, weighted, and the sum of its keys' weights."""
-    kept = np.float32(0.0)
+    kept, last = np.float32(0.0), np.float32(0.0)
     for c in range(6):
         change[c] = np.float32(0.0)
     for q in range(stack.first_key[e], stack.first_key[e + 1]):
@@ -404,14 +418,20 @@ def _change_of(b, e, caster, stack, is_in, own_at, own_weight, decoded, change):
         leaf = stack.leaf[one, caster]
         if leaf < 0:
             continue
-        for s in range(own_at.shape[2]):
-            weight = own_weight[b, one, s] * mask
-            if weight == np.float32(0.0):
+        for c in range(6):
+            column = stack.column[one, c]
+            if column < 0:
                 continue
-            first = own_at[b, one, s] + leaf
-            for c in range(6):
-                if stack.column[one, c] >= 0:
-                    change[c] += weight * decoded[first + stack.column[one, c] * stack.n_cells[one]]
+            if c % 3 > 0 and column == stack.column[one, c - 1]:
+                value = last
+            else:
+                value = np.float32(0.0)
+                for s in range(own_at.shape[2]):
+                    if own_weight[b, one, s] != np.float32(0.0):
+                        place = own_at[b, one, s] + leaf + column * stack.n_cells[one]
+                        value += own_weight[b, one, s] * decoded[place]
+            last = value
+            change[c] += mask * value
     return kept
 
 
