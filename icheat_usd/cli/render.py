@@ -57,7 +57,8 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
         "--noise",
         type=fraction,
         metavar="SHARE",
-        help="relative error that a record of cached light may have by chance; default 0.02",
+        help="relative error by chance of cached light that reaches 10 pixels, from which more rays are traced; "
+        "default 0.0125",
     )
     parser.add_argument(
         "--photons", action="store_true", help="earlier bounces by a photon map instead of the gather samples"

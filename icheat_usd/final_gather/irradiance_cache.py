@@ -20,10 +20,11 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
 
 _COARSEST = 32  # pixels between the first places that are looked at
+_USUAL_REACH = 10.0  # pixels
 _RAYS_AT_ONCE = 1 << 19
 _CREASE = 0.05  # pixels from the next surface, below which a record counts for little, so that better ones are made
 _LEAST_TRUST = 1e-3
-_NEXT_HEMISPHERE = 1 << 27  # between the numbers of random sequences, which count modulo 2^32
+_NEXT_HEMISPHERE = 1 << 27  # between the streams of a record's hemispheres, see `kernels.record_rays`
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,10 @@ class CacheSettings:
     """
 
     n_theta: int = 12  #: rings of a hemisphere of rays; 3 times as many sectors
-    noise: float = 0.02  #: relative standard error of a record's irradiance, to which it gets more hemispheres
-    most_hemispheres: int = 8
+    #: Relative standard error that one hemisphere leaves in a record that reaches 10 pixels, from which it gets more
+    #: of them: in proportion to the error, and to the reach.
+    noise: float = 0.0125
+    most_hemispheres: int = 32
     accuracy: float = 0.35  #: reach of a record, in harmonic mean distances of the surfaces around
     clearance: float = 1.0  #: and no more of the distance of the nearest one
     least_reach: float = 2.5  #: pixels
@@ -251,7 +254,7 @@ class IrradianceCache:
         for begin in range(0, len(places.extent), at_once):
             some = np.arange(begin, min(begin + at_once, len(places.extent)))
             points = take_points(places.points, some)
-            found, spread = self._measure(points, first + some)
+            found, spread = self._measure(points, places.extent[some], first + some)
             tables.append(self._reaches(points, places.extent[some], found, spread))
             values.append(found)
         self._judge(places, RecordValues(*(np.concatenate(column) for column in zip(*values, strict=True))))
@@ -272,13 +275,18 @@ class IrradianceCache:
         )
         self._index = None
 
-    def _measure(self, points: SurfacePoints, record: I64) -> tuple[RecordValues, F32]:
-        """Values of new records and the spread of their distances, from as many hemispheres as their noise asks for."""
+    def _measure(self, points: SurfacePoints, extent: F32, record: I64) -> tuple[RecordValues, F32]:
+        """Values of new records and the spread of their distances, from as many hemispheres as their noise asks for.
+
+        The error of a picture, the sum of ``area * noise^2 / number`` over records, is least for the rays that are
+        traced in all where numbers go with the noise of one hemisphere and with the root of the area.
+        """
         settings = self.settings
         rays = self.tracer.trace(points, record)
         values, spread = self.sums(rays, rays.radiance(self.cells))
         self._keep(rays, points, record)
-        wanted = np.ceil((spread[:, 2].astype(np.float64) / settings.noise) ** 2)
+        reach = np.clip(self._geometric(spread) / extent, settings.least_reach, settings.most_reach).astype(np.float64)
+        wanted = np.rint(spread[:, 2] / settings.noise * (reach / _USUAL_REACH))
         number = np.clip(wanted, 1, settings.most_hemispheres).astype(np.int64)
         closeness = 1 / spread[:, 0].astype(np.float64)
         for further in range(1, int(number.max(initial=1))):
@@ -309,7 +317,7 @@ class IrradianceCache:
     ) -> tuple[kernels.RecordTable, F32]:
         settings = self.settings
         least = settings.least_reach * extent
-        reach = np.minimum(settings.accuracy * spread[:, 0], settings.clearance * spread[:, 1])
+        reach = self._geometric(spread)
         # Where light changes faster than surfaces tell.
         change = np.sqrt((values.by_move.astype(np.float64) ** 2).sum(axis=(1, 2)))
         size = np.sqrt((values.irradiance.astype(np.float64) ** 2).sum(axis=1))
@@ -326,6 +334,10 @@ class IrradianceCache:
             np.ascontiguousarray(points.position), np.ascontiguousarray(points.shading_normal), wide, turn, trust
         )
         return table, least.astype(np.float32)
+
+    def _geometric(self, spread: F32) -> F32:
+        """Reach of records by the surfaces around, (n,) metres."""
+        return np.minimum(self.settings.accuracy * spread[:, 0], self.settings.clearance * spread[:, 1])
 
     def _judge(self, places: Places, fresh: RecordValues) -> None:
         """Old records end before new ones that they predict badly."""

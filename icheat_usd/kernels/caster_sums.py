@@ -9,7 +9,6 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.samples import basis
 from icheat_usd.kernels.simd import address_of, color_product, load_color, load_rgb, scale_add, store_color
@@ -168,7 +167,7 @@ def caster_sums(rays, sent, local, begin, share, seed, n_theta, n_phi, out):  # 
     """
     for r in prange(len(begin) - 1):
         if begin[r] < begin[r + 1]:
-            first_turn = turn_of(hash_combine(seed, rays.stream[r]))
+            first_turn = turn_of(seed, rays.stream[r])
             _sums_of_row(r, rays, sent, local, begin[r], begin[r + 1], share[r], first_turn, n_theta, n_phi, out)
 
 

@@ -17,29 +17,38 @@ from icheat_usd.kernels.cell_map import (
 )
 from icheat_usd.kernels.gather_rows import DETOUR, NOTHING, trace_16
 from icheat_usd.kernels.locate import nearest_sample
-from icheat_usd.kernels.random import hash_combine, to_unit
+from icheat_usd.kernels.random import hash_combine, sobol_pair, to_unit
 from icheat_usd.kernels.samples import basis, unit_circle
 
 _INVALID = np.uint32(0xFFFFFFFF)
 _TOUCHING = np.float32(1e-6)  # metres: a ray may end where it starts, in a crease
+_HEMISPHERES = 27  # the bit of a stream from which it counts the hemispheres of one record
 _BLOCK = 4  # strata along each side of a packet: rays of one cone
 
 
 @kernel
-def turn_of(seed):  # type: ignore[no-untyped-def]
-    """Where the first azimuth of a hemisphere lies, in turns."""
-    return to_unit(hash_combine(seed, 0x7F4A7C15))
+def shared_seed(seed, stream):  # type: ignore[no-untyped-def]
+    """What the hemispheres of one record draw their random numbers from."""
+    return hash_combine(seed, stream & ((1 << _HEMISPHERES) - 1))
 
 
 @kernel
-def stratum_direction(sx, sy, sz, seed, j, k, n_theta, n_phi):  # type: ignore[no-untyped-def]
+def turn_of(seed, stream):  # type: ignore[no-untyped-def]
+    """Where the first azimuth of a hemisphere lies, in turns; the same for all of one record."""
+    return to_unit(hash_combine(shared_seed(seed, stream), 0x7F4A7C15))
+
+
+@kernel
+def stratum_direction(sx, sy, sz, seed, stream, j, k, n_theta, n_phi):  # type: ignore[no-untyped-def]
     """A direction of stratum (j, k) about a unit normal, jittered; all strata hold the same share of the cosine.
 
-    Rings j go outwards from the normal, ``sin(theta)^2`` from ``j / n_theta`` to ``(j + 1) / n_theta``.
+    Rings j go outwards from the normal, ``sin(theta)^2`` from ``j / n_theta`` to ``(j + 1) / n_theta``. What the
+    hemispheres of one record have in a stratum are points of one sequence, and spread over it.
     """
-    word = hash_combine(seed, j * n_phi + k)
-    u = (np.float32(j) + to_unit(word)) / np.float32(n_theta)
-    v = (np.float32(k) + to_unit(hash_combine(word, 1))) / np.float32(n_phi) + turn_of(seed)
+    word = hash_combine(shared_seed(seed, stream), j * n_phi + k)
+    within, along = sobol_pair(stream >> _HEMISPHERES, word)
+    u = (np.float32(j) + within) / np.float32(n_theta)
+    v = (np.float32(k) + along) / np.float32(n_phi) + turn_of(seed, stream)
     if v >= np.float32(1.0):
         v -= np.float32(1.0)
     radius = np.float32(np.sqrt(u))
@@ -64,7 +73,8 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
     position,
     shading_normal,
     normal,
-    own,
+    seed,
+    stream,
     n_theta,
     n_phi,
     out_cell,
@@ -91,7 +101,7 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
     for j0 in range(0, n_theta, _BLOCK):
         for k0 in range(0, n_phi, _BLOCK):
             for e in range(16):
-                x, y, z = stratum_direction(sx, sy, sz, own, j0 + e // _BLOCK, k0 + e % _BLOCK, n_theta, n_phi)
+                x, y, z = stratum_direction(sx, sy, sz, seed, stream, j0 + e // _BLOCK, k0 + e % _BLOCK, n_theta, n_phi)
                 valid[e] = -1 if x * gx + y * gy + z * gz > np.float32(0.0) else 0
                 rays[0, e] = position[r, 0]
                 rays[1, e] = position[r, 1]
@@ -202,7 +212,8 @@ def trace_hemispheres(  # type: ignore[no-untyped-def]
             position,
             shading_normal,
             normal,
-            hash_combine(seed, stream[r]),
+            seed,
+            stream[r],
             n_theta,
             n_phi,
             out_cell,
@@ -218,19 +229,19 @@ def hemisphere_directions(shading_normal, row, column, stream, seed, n_theta, n_
     """Directions (n, 3) of rays `column` of hemispheres `row`, and a number of its own for choices on its way."""
     for q in prange(len(row)):
         r, ray = row[q], column[q]
-        own = hash_combine(seed, stream[r])
         x, y, z = stratum_direction(
             shading_normal[r, 0],
             shading_normal[r, 1],
             shading_normal[r, 2],
-            own,
+            seed,
+            stream[r],
             ray // n_phi,
             ray % n_phi,
             n_theta,
             n_phi,
         )
         out[q, 0], out[q, 1], out[q, 2] = x, y, z
-        counter[q] = np.int32(hash_combine(own, ray))
+        counter[q] = np.int32(hash_combine(hash_combine(seed, stream[r]), ray))
 
 
 @parallel_kernel
@@ -241,9 +252,8 @@ def patch_keys(position, shading_normal, stream, seed, n_theta, n_phi, distance,
     """
     for q in prange(len(flat)):
         r, ray = flat[q] // (n_theta * n_phi), flat[q] % (n_theta * n_phi)
-        own = hash_combine(seed, stream[r])
         nx, ny, nz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
-        x, y, z = stratum_direction(nx, ny, nz, own, ray // n_phi, ray % n_phi, n_theta, n_phi)
+        x, y, z = stratum_direction(nx, ny, nz, seed, stream[r], ray // n_phi, ray % n_phi, n_theta, n_phi)
         d = distance[r, ray]
         level = np.floor(np.log2(max(d, _TOUCHING)))
         size = np.float32(2.0**level)

@@ -9,7 +9,6 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.samples import basis
 
@@ -44,7 +43,7 @@ def record_sums(  # type: ignore[no-untyped-def]
             radiance,
             distance,
             shading_normal,
-            turn_of(hash_combine(seed, stream[r])),
+            turn_of(seed, stream[r]),
             n_theta,
             n_phi,
             irradiance,

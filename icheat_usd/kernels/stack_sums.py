@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.caster_sums import N_VALUES, add_weighted, ray_weights, turn_to_world
-from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.simd import (
     address_of,
@@ -280,7 +279,7 @@ def stack_of_rays(  # type: ignore[no-untyped-def]
     for g in prange(len(record)):
         for q in range(group[g], group[g + 1]):
             r = order[q]
-            turn = turn_of(hash_combine(seed, rays.stream[r]))
+            turn = turn_of(seed, rays.stream[r])
             _of_rays(
                 r,
                 record[g],
