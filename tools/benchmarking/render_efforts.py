@@ -25,9 +25,9 @@ def _cached(n_gather: int, bounce_rays: int, light_samples: int, settings: Gathe
 EFFORTS: dict[str, RenderEffort] = {
     "brute 4 x 16": RenderEffort(GatherSettings(method="brute", samples_per_pixel=4, gather_rays=16), PREVIEW),
     "cached 0": _cached(
-        8_192,
-        32,
-        1,
+        16_384,
+        64,
+        2,
         GatherSettings(1, light_samples=1, edge_samples=4, cache=CacheSettings(noise=0.05, least_reach=3.0)),
     ),
     "cached 1": _cached(
