@@ -28,6 +28,8 @@ from icheat_usd.kernels.simd import (
 #: New slots of one record from one call, beyond which places take the nearest.
 MOST_SLOTS = 32
 
+_MOST_GROWTH = np.float32(8.0)  # of light between two masks, beyond which gradients do not follow
+
 
 @kernel
 def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-untyped-def]
@@ -331,7 +333,7 @@ def _mix_at(  # type: ignore[no-untyped-def]
     out,
 ):
     values_0, derivative_0 = address_of(values), address_of(derivative)
-    zero = np.float32(0.0)
+    zero, one = np.float32(0.0), np.float32(1.0)
     total = color_of(zero, zero, zero)
     nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
     for k in range(count[p]):
@@ -340,17 +342,26 @@ def _mix_at(  # type: ignore[no-untyped-def]
         mx, my, mz = facing[r, 0], facing[r, 1], facing[r, 2]
         own = values_0 + 16 * N_VALUES * s
         total = scale_add(load_color(own), w, total)
+        largest = 0
+        for c in range(1, 3):
+            if abs(values[s, 0, c]) > abs(values[s, 0, largest]):
+                largest = c
+        moved = values[s, 0, largest]
+        if derived[s] < derived[s + 1]:
+            pattern = slot_pattern[s]
+            for e in range(soft_begin[pattern], soft_begin[pattern + 1]):
+                row = soft_row[e]
+                step = masks[column, row] - slot_masks[s, row]
+                d = derived[s] + e - soft_begin[pattern]
+                moved += step * derivative[d, largest]
+                total = scale_add(load_color(derivative_0 + 16 * d), w * step, total)
+        # How light changes from place to place grows with the masks as the light itself does, for one edit exactly.
+        if moved != values[s, 0, largest]:
+            w *= min(max(moved / values[s, 0, largest], zero), _MOST_GROWTH) if values[s, 0, largest] != zero else one
         total = scale_add(load_color(own + 16), w * (my * nz - mz * ny), total)
         total = scale_add(load_color(own + 32), w * (mz * nx - mx * nz), total)
         total = scale_add(load_color(own + 48), w * (mx * ny - my * nx), total)
         total = scale_add(load_color(own + 64), w * dx, total)
         total = scale_add(load_color(own + 80), w * dy, total)
         total = scale_add(load_color(own + 96), w * dz, total)
-        if derived[s] < derived[s + 1]:
-            pattern = slot_pattern[s]
-            for e in range(soft_begin[pattern], soft_begin[pattern + 1]):
-                row = soft_row[e]
-                step = w * (masks[column, row] - slot_masks[s, row])
-                to = derivative_0 + 16 * (derived[s] + e - soft_begin[pattern])
-                total = scale_add(load_color(to), step, total)
     store_rgb(address_of(out) + 12 * q, total)

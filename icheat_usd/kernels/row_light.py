@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels import simd
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.samples import basis
 
@@ -287,7 +286,7 @@ def _sums_of_base(  # type: ignore[no-untyped-def]
 def _linear_in_light(h, hemispheres, seed, n_theta, n_phi, out):  # type: ignore[no-untyped-def]
     """What one unit of radiance of each ray adds to irradiance and its gradients (`record_sums.record_sums`)."""
     distance, m, n = hemispheres.distance, n_theta, n_phi
-    first_turn = turn_of(hash_combine(seed, hemispheres.stream[h]))
+    first_turn = turn_of(seed, hemispheres.stream[h])
     share = hemispheres.share[h]
     shrunk = share * hemispheres.shrink[h]
     value = np.float32(np.pi / (m * n)) * share
