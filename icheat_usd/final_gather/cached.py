@@ -21,7 +21,7 @@ from icheat_usd.final_gather.gatherer import (
 from icheat_usd.final_gather.hemispheres import Hemispheres, Part
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, Places
 from icheat_usd.final_gather.light_parts import light_of_records
-from icheat_usd.final_gather.receiver_sets import MOST_SOFT, soft_masks, touched
+from icheat_usd.final_gather.receiver_sets import MOST_SOFT, Touched, soft_masks, touched
 from icheat_usd.final_gather.row_records import RowRecords
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.materials import take_points
@@ -42,7 +42,7 @@ class CachedGather:
     samples_per_pixel : int
         Of pixels with camera samples that no record reaches; these share the rays that a record has.
     is_kept : bool
-        Whether to keep `samples`, what was found at every call of `light`, for other stacks.
+        Whether to keep `samples` and `receivers`, what was found at every call of `light`, for other stacks.
     """
 
     def __init__(
@@ -58,8 +58,10 @@ class CachedGather:
         self._is_kept = is_kept
         self._own_rings = max(4, 4 * round(cache.settings.n_theta / (4 * np.sqrt(samples_per_pixel))))
         self.samples: list[Sampled] = []
+        self.receivers: list[Touched] = []
         self._parts = CachedParts(gatherer.parts, cache)
         self.hemispheres = hemispheres_of(cache)
+        self.hemispheres.is_kept = is_kept
         self._parts.take_edits(self.hemispheres)
         stacks = () if gatherer.field.is_identity else (*gatherer.prefixes, gatherer)
         self._stacks = [(stack, edited_records(stack, cache, self.hemispheres)) for stack in stacks]
@@ -71,7 +73,12 @@ class CachedGather:
             self.samples.append(sample)
         if not self._stacks:
             return GatheredLight(sample.base, sample.base.copy(), (), self._parts.light(sample, sample.base))
-        *steps, edited = (under_stack(stack, records, sample) for stack, records in self._stacks)
+        *before, (gatherer, last) = self._stacks
+        steps = [under_stack(stack, records, sample) for stack, records in before]
+        receivers = touched(gatherer.field, places.points)
+        if self._is_kept:
+            self.receivers.append(receivers)
+        edited = under_stack(gatherer, last, sample, receivers)
         return GatheredLight(sample.base, edited, tuple(steps), self._parts.light(sample, edited))
 
     def _sample(self, places: Places, to_eye: F32, stream: I64, draws: I64, seed: int) -> Sampled:
@@ -113,11 +120,23 @@ class Sampled(NamedTuple):
     own_rays: Hemispheres | None  #: of these
 
 
-def under_stack(g: Gatherer, records: MaskedRecords | RowRecords | EditedRecords, sampled: Sampled) -> F32:
-    """Light of camera samples under the stack of a gatherer, (n, 3); where no edit acts the bits of `base`."""
+def under_stack(
+    g: Gatherer,
+    records: MaskedRecords | RowRecords | EditedRecords,
+    sampled: Sampled,
+    receivers: Touched | None = None,
+) -> F32:
+    """Light of camera samples under the stack of a gatherer, (n, 3); where no edit acts the bits of `base`.
+
+    Parameters
+    ----------
+    receivers : Touched, optional
+        Those of the samples, if they are known.
+    """
     points, base, shiny = sampled.points, sampled.base, sampled.shiny
     edited = base.copy()
-    receivers = touched(g.field, points)
+    if receivers is None:
+        receivers = touched(g.field, points)
     where = receivers.where
     if len(where) == 0:
         return edited

@@ -7,6 +7,7 @@ amounts and colours, and any masks of the receivers.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icheat_usd.final_gather.gatherer import GatherSolution
 from icheat_usd.final_gather.hemispheres import Hemispheres
@@ -82,17 +83,25 @@ class LightByCaster:
 
     def _of_rays(self, rays: RecordRays, share: F32, some: Bool) -> tuple[I64, I32, F32]:
         """Row, instance and light of every pair of a row and what it sees."""
-        n, n_rays = rays.cell.shape
         table = ray_table(rays)
-        local = np.empty((n, n_rays), np.int16)
-        listed = np.empty((n, min(int(self.selected.sum()), n_rays)), np.int32)
-        number = np.empty(n, np.int32)
-        kernels.list_casters(table, self.selected.view(np.uint8), some.view(np.uint8), local, number, listed)
-        begin = np.concatenate([[0], np.cumsum(number, dtype=np.int64)])
-        light = np.zeros((int(begin[-1]), *self.values.shape[1:]), np.float32)
+        row, caster, local, begin = list_of_casters(rays, table, self.selected, some)
+        light = np.zeros((len(row), *self.values.shape[1:]), np.float32)
         kernels.caster_sums(table, self.sent, local, begin, share, rays.seed, rays.n_theta, rays.n_phi, light)
-        row = np.repeat(np.arange(n), number)
-        return row, listed[row, np.arange(len(row)) - begin[row]], light
+        return row, caster, light
+
+
+def list_of_casters(
+    rays: RecordRays, table: kernels.RayTable, selected: Bool, some: Bool
+) -> tuple[I64, I32, NDArray[np.int16], I64]:
+    """Row and instance of every pair of a row and what it sees, place of each ray's among its row's, pairs by row."""
+    n, n_rays = rays.cell.shape
+    local = np.empty((n, n_rays), np.int16)
+    listed = np.empty((n, min(int(selected.sum()), n_rays)), np.int32)
+    number = np.empty(n, np.int32)
+    kernels.list_casters(table, selected.view(np.uint8), some.view(np.uint8), local, number, listed)
+    begin = np.concatenate([[0], np.cumsum(number, dtype=np.int64)])
+    row = np.repeat(np.arange(n), number)
+    return row, listed[row, np.arange(len(row)) - begin[row]], local, begin
 
 
 def ray_table(rays: RecordRays) -> kernels.RayTable:

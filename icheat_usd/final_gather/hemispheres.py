@@ -14,6 +14,8 @@ from icheat_usd.scene import F32, I64, SurfacePoints
 
 if TYPE_CHECKING:
     from icheat_usd.final_gather.caster_light import LightByCaster
+    from icheat_usd.final_gather.painted_light import LightByMasks
+    from icheat_usd.final_gather.row_light import RowLight
 
 _RAYS_AT_ONCE = 1 << 19
 
@@ -32,7 +34,10 @@ class Hemispheres:
 
     parts: list[Part]
     shrink: F32  #: (n,) factor on what changes with place
+    is_kept: bool = False  #: whether other stacks will ask for the same
     light: list[LightByCaster] = field(default_factory=list)
+    painted: list[LightByMasks] = field(default_factory=list)
+    of_rows: list[RowLight] = field(default_factory=list)
     _shares: F32 | None = None
 
     @property

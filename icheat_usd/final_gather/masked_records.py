@@ -19,9 +19,10 @@ from icheat_usd.final_gather.caster_light import light_by_caster, ray_table, sen
 from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup
+from icheat_usd.final_gather.painted_light import bits, is_of_few, light_by_masks
 from icheat_usd.final_gather.receiver_sets import Touched, patterns
+from icheat_usd.kernels import painted_sums, stack_sums
 from icheat_usd.kernels import record_slots as kernels
-from icheat_usd.kernels import stack_sums
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
 
@@ -64,7 +65,8 @@ class MaskedRecords:
         table = mask_table(_acting(self._field), gatherer.snapshot.n_instances)
         assert table is not None
         self._casters = table
-        self._by_rays = bool((table.mask >= 0).any())
+        self._is_painted = bool((table.mask >= 0).any())
+        self._by_rays = not is_of_few(table)
         is_soft = _vary(self._field) & (bend > 0)
         self._bend = np.where(is_soft, bend, np.float32(0))
         self._patterns = _Patterns(is_soft, bend > 0)
@@ -231,6 +233,20 @@ class MaskedRecords:
         needed = np.diff(slots.begin) > 0
         if self._by_rays:
             self._ray_by_ray(of, needed, slots, values, derivative)
+        elif self._is_painted:
+            known = light_by_masks(of, self._sent, self._casters)
+            known.find(of, self._geometry, needed)
+            painted_sums.stack_of_painted(
+                known.begin,
+                *known.entries[1:],
+                bits(self._casters),
+                self._casters,
+                self._stack,
+                slots,
+                np.flatnonzero(needed),
+                values,
+                derivative,
+            )
         else:
             light = light_by_caster(of, self._sent, np.diff(self._casters.begin) > 0)
             light.find(of, needed)

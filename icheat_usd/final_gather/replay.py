@@ -12,6 +12,8 @@ from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.final_gather.cached import CachedGather, under_stack
 from icheat_usd.final_gather.edited_records import edited_records
 from icheat_usd.final_gather.gatherer import Gatherer, GatherSolution
+from icheat_usd.final_gather.receiver_sets import Touched, touched
+from icheat_usd.final_gather.same_stack import same_receivers
 from icheat_usd.samples import ViewSamples
 from icheat_usd.samples.develop import develop
 from icheat_usd.scene import F32, F64
@@ -42,6 +44,7 @@ class Replay:
 
     def __init__(self, gatherer: Gatherer, cached: CachedGather, bands: list[KeptBand], per_light: F32) -> None:
         self._gatherer, self._cached, self._bands, self._per_light = gatherer, cached, bands, per_light
+        self._receivers = cached.receivers  # of each band, under the last stack
 
     def edited(self, field: EditField) -> F64:
         """Indirect light under a stack, (height, width, 3).
@@ -55,11 +58,22 @@ class Replay:
         cache = self._cached.cache
         records = None if field.is_identity else edited_records(gatherer, cache, self._cached.hemispheres)
         parts = []
-        for (pixels, view), sampled in zip(self._bands, self._cached.samples, strict=True):
-            light = sampled.base if records is None else under_stack(gatherer, records, sampled)
+        receivers = self._touched(field)
+        for band, ((pixels, view), sampled) in enumerate(zip(self._bands, self._cached.samples, strict=True)):
+            light = sampled.base if records is None else under_stack(gatherer, records, sampled, receivers[band])
             parts.append(develop(view, light, pixels))
         camera = gatherer.snapshot.camera
         return np.concatenate(parts).reshape(camera.height, camera.width, 3)
+
+    def _touched(self, field: EditField) -> list[Touched]:
+        """Receivers in each band, found again only if other places are touched than by the last stack."""
+        if field.is_identity:
+            return []
+        if self._receivers and same_receivers(self._receivers[0].field, field):
+            self._receivers = [receivers._replace(field=field) for receivers in self._receivers]
+        else:
+            self._receivers = [touched(field, sampled.points) for sampled in self._cached.samples]
+        return self._receivers
 
     def _under(self, field: EditField) -> Gatherer:
         g = self._gatherer

@@ -8,7 +8,7 @@ weights of each, about those at the record.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,29 +23,65 @@ from icheat_usd.kernels import record_mixtures
 from icheat_usd.kernels import row_light as kernels
 from icheat_usd.kernels.row_sites import NEIGHBOURS
 from icheat_usd.materials import concatenate_points, take_points
-from icheat_usd.scene import F32, I64, Bool, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, U8, Bool, SurfacePoints
 
 #: Decoded rows that are held at once; within the processor's caches, so that rays find their leaves fast.
 _DECODED_BYTES = 24 << 20
 
 
-class RowLight:
-    """Light of records' rows, found when a camera sample first asks for it.
+#: Stacks whose light is kept for others, and calls whose sums are known to be there.
+_MOST_KEPT, _MOST_LISTED = 2, 64
+
+
+class _Listed(NamedTuple):
+    """Places whose sums are there, and what they asked for."""
+
+    found: Lookup
+    where: I64
+    which: I64
+    begin: I64
+    entry: I32
+    rows: I32
+    is_used: Bool
+
+    def is_like(self, other: _Listed) -> bool:
+        """Whether these places ask for the same sums."""
+        if self.found is not other.found:
+            return False
+        return all(np.array_equal(one, two) for one, two in zip(self[1:], other[1:], strict=True))
+
+
+def row_light(gatherer: Gatherer, hemispheres: Hemispheres, position: F32, normal: F32) -> RowLight:
+    """Light of records for a stack, from what is known of it under another that differs in amounts alone.
 
     Parameters
     ----------
     position, normal : (n_records, 3) float32
-    casters : Ends
-        The gather samples.
     """
+    stack, sent = RowStack(gatherer.field), _sent(gatherer)
+    for one in hemispheres.of_rows:
+        if one.take_amounts(gatherer, stack, sent):
+            return one
+    found = RowLight(gatherer, hemispheres, position, normal, stack, sent)
+    hemispheres.of_rows[:] = [*hemispheres.of_rows[1 - _MOST_KEPT :], found]
+    return found
 
-    def __init__(self, gatherer: Gatherer, hemispheres: Hemispheres, position: F32, normal: F32, casters: Ends) -> None:
-        assert gatherer.solution is not None
-        self._casters = casters
+
+def _sent(gatherer: Gatherer) -> F32:
+    assert gatherer.solution is not None
+    return gatherer.solution.b if gatherer.solution.sent is None else gatherer.solution.sent
+
+
+class RowLight:
+    """Light of records' rows, found when a camera sample first asks for it."""
+
+    def __init__(
+        self, gatherer: Gatherer, hemispheres: Hemispheres, position: F32, normal: F32, stack: RowStack, sent: F32
+    ) -> None:
         self._gatherer, self._hemispheres, self._position, self._normal = gatherer, hemispheres, position, normal
-        self._stack = RowStack(gatherer.field)
-        self._rows = self._stack.rows
-        self._sent = gatherer.solution.b if gatherer.solution.sent is None else gatherer.solution.sent
+        self._stack, self._rows, self._sent = stack, stack.rows, sent
+        self._casters: Ends | None = None
+        self._listed: list[_Listed] = []
         self._sets: dict[bytes, int] = {}
         self._slot = np.zeros((0, self._hemispheres.n), np.int32)
         self._acts = np.zeros((0, self._stack.n_keys), np.uint8)
@@ -69,25 +105,9 @@ class RowLight:
         entry = number[mixed.entry]
         active = self._stack.acting_payloads(self._acts)
         rows, weights = self._stack.mixtures(receivers.ends())
-        asked = np.zeros((len(self._slot), self._hemispheres.n), np.uint8)
-        record_mixtures.mark_records(found.number, found.record, where, which, mixed.begin, entry, asked)
-        n_bases, n_sums = len(self._record), self._n
-        self._add_bases(asked.view(np.bool_) & (self._slot < 0))
-        own = np.arange(len(self._record) - n_bases)
-        self._list(
-            np.ones(len(own), np.int32),
-            self._record[n_bases:, None].astype(np.int32),
-            own,
-            own,
-            np.arange(len(own) + 1),
-            self._set[n_bases:].astype(np.int32),
-            active,
-            self._own_row[n_bases:],
-            self._own_weight[n_bases:],
-        )
-        places = found.number, found.record, where, which, mixed.begin, entry
-        self._list(*places, active, rows, weights)
-        self._sum(n_bases, n_sums)
+        asked = _Listed(found, where, which, mixed.begin, entry, rows, weights != 0)
+        if not any(asked.is_like(one) for one in self._listed):
+            self._enter(asked, active, weights)
         out = np.empty((len(where), 3), np.float32)
         kernels.mix_rows(
             self._position,
@@ -111,7 +131,48 @@ class RowLight:
         )
         return out
 
+    def take_amounts(self, gatherer: Gatherer, stack: RowStack, sent: F32) -> bool:
+        """Go on with another stack, if what is known holds under it too.
+
+        A sum is of one row at full amount: what the amount of its edit makes of it is in the weights of camera
+        samples. Where several edits act, the others' amounts are in the sum.
+        """
+        is_same = (
+            gatherer.is_part == self._gatherer.is_part
+            and not self._stack.has_several(self._acts).any()
+            and stack.differs_in_amounts_alone(self._stack)
+            and np.array_equal(sent, self._sent)
+        )
+        if is_same:
+            self._gatherer, self._stack = gatherer, stack
+        return is_same
+
     # What is asked for
+
+    def _enter(self, listed: _Listed, active: U8, weights: F32) -> None:
+        """See to it that the sums that places ask for are known."""
+        found, where, which, begin, entry, rows, _ = listed
+        places = found.number, found.record, where, which, begin, entry
+        asked = np.zeros((len(self._slot), self._hemispheres.n), np.uint8)
+        record_mixtures.mark_records(*places, asked)
+        n_bases, n_sums = len(self._record), self._n
+        self._add_bases(asked.view(np.bool_) & (self._slot < 0))
+        own = np.arange(len(self._record) - n_bases)
+        self._list(
+            np.ones(len(own), np.int32),
+            self._record[n_bases:, None].astype(np.int32),
+            own,
+            own,
+            np.arange(len(own) + 1),
+            self._set[n_bases:].astype(np.int32),
+            active,
+            self._own_row[n_bases:],
+            self._own_weight[n_bases:],
+        )
+        self._list(*places, active, rows, weights)
+        self._sum(n_bases, n_sums)
+        if self._hemispheres.is_kept:
+            self._listed = [*self._listed[1 - _MOST_LISTED :], listed]
 
     def _set_of(self, is_in: Bool) -> int:
         name = is_in.tobytes()
@@ -246,6 +307,8 @@ class RowLight:
         """Hemispheres of some records, and the edits at the ends of their rays."""
         field, solution = self._gatherer.field, self._gatherer.solution
         assert solution is not None
+        if self._casters is None:
+            self._casters = field.casters(solution.gather.points)
         snapshot = self._gatherer.snapshot
         varied = self._stack.varied(snapshot.n_instances)
         rays = collect(self._hemispheres, records, snapshot, solution.gather, varied)

@@ -8,7 +8,7 @@ from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup
 from icheat_usd.final_gather.receiver_sets import Touched
-from icheat_usd.final_gather.row_light import RowLight
+from icheat_usd.final_gather.row_light import row_light
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
 
@@ -22,8 +22,7 @@ class RowRecords:
     def __init__(self, gatherer: Gatherer, cache: IrradianceCache, hemispheres: Hemispheres) -> None:
         assert gatherer.solution is not None
         self._gatherer = gatherer
-        self._casters = gatherer.field.casters(gatherer.solution.gather.points)
-        self._light = RowLight(gatherer, hemispheres, cache.table.position, cache.table.normal, self._casters)
+        self._light = row_light(gatherer, hemispheres, cache.table.position, cache.table.normal)
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
         """Change of irradiance at m receivers with records, (m, 3); `found` is of all points."""
@@ -32,7 +31,7 @@ class RowRecords:
     def change_alone(self, points: SurfacePoints, rays: Hemispheres, row: I64, receivers: Touched) -> F32:
         """The same at m receivers without records, from hemispheres of their own; `row` (m,) is that of each."""
         m, stands = len(row), rays.parts[0].points
-        own = RowLight(self._gatherer, rays, stands.position, stands.shading_normal, self._casters)
+        own = row_light(self._gatherer, rays, stands.position, stands.shading_normal)
         # Each is its own record.
         itself = Lookup(np.ones(m, np.int32), row[:, None].astype(np.int32), *np.ones((2, m, 1), np.float32))
         at = take_points(points, receivers.where)

@@ -12,6 +12,7 @@ from icheat_usd.edits.encodings.rows import BoundRows
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.operations import Level, PairCoefficients
+from icheat_usd.final_gather.same_stack import same_casters
 from icheat_usd.kernels import row_light as kernels
 from icheat_usd.kernels.row_sites import NEIGHBOURS
 from icheat_usd.scene import F32, I32, U8, Bool
@@ -54,6 +55,7 @@ class RowStack:
     """
 
     def __init__(self, field: EditField) -> None:
+        self._field = field
         self._edits = [bound for bound in field.edits if bound.level is not Level.VIEW]
         self._keys: list[_Key] = []
         self.rows: list[BoundRows] = []
@@ -73,6 +75,15 @@ class RowStack:
     @property
     def n_keys(self) -> int:
         return len(self._keys)
+
+    def differs_in_amounts_alone(self, other: RowStack) -> bool:
+        """Whether two stacks have the same keys, all of them rows, which act on the same light and casters."""
+        if self._keys != other._keys or len(self.rows) < len(self._keys):
+            return False
+        return self._field.n_rows == other._field.n_rows and all(
+            same_casters(a, b) and a.edit.blend is b.edit.blend and np.array_equal(a.groups, b.groups)
+            for a, b in zip(self._edits, other._edits, strict=True)
+        )
 
     # Receivers in some of the edits; `acts` is (., n_keys)
 

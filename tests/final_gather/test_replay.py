@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from icheat_usd.edits.model import Edit, KeyedPayload, Payload, SurfaceMask
 from icheat_usd.final_gather import GatherSettings, final_gather, masked_records
 from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, WHITE, painted, previews, soft
+from tests.final_gather.test_rows import FLOOR, baked
 from tests.pipeline import TINY, select
 
 SETTINGS = GatherSettings(4, 16, 4, 4, edge_samples=2, cache=TINY)
@@ -25,6 +28,12 @@ BRUSHED = (
     brushed("/b", "emit", (0.2, 0.3, 0.1), 4),
     brushed("/c", "scale", (0.1, 2.0, 4.0), 5),
 )
+
+
+def rows(**changed: object) -> Edit:
+    return replace(baked("/far", "falloff", FLOOR, select("/red", "/green", "/ceiling"), exponent=1.0), **changed)
+
+
 STACKS = {
     "nothing": (),
     "objects": (BLEED,),
@@ -85,6 +94,53 @@ def test_light_under_masks_is_the_light_of_the_rays(name, change, tolerance, mon
     slow = rendered(*STACKS[name]).indirect_edited
     assert (fast != slow).any()
     np.testing.assert_allclose(fast, slow, rtol=tolerance, atol=1e-6)
+
+
+def rows_and_others() -> tuple[Edit, ...]:
+    """Rows on the floor and the back wall, beside what is no row."""
+    return (rows(), painted("scale", {"gain": 4.0}), BLEED)
+
+
+def changed_stacks(edits: tuple[Edit, ...]) -> list[tuple[Edit, ...]]:
+    """Amounts twice, one edit muted, and all as they were."""
+    first, *others = edits
+    amounts = [(replace(first, amount=amount), *others) for amount in (0.4, 0.7)]
+    muted = [(replace(first, enabled=False), *others)] if others else []
+    return [*amounts, *muted, edits]
+
+
+@pytest.mark.parametrize(
+    "edits",
+    [BRUSHED[:1], BRUSHED, (rows(),), (rows(), rows(path="/again", amount=0.5)), rows_and_others()],
+    ids=["brush", "brushes", "rows", "rows over rows", "rows and others"],
+)
+def test_changed_edits_replay_as_they_render(edits):
+    kept = rendered(*edits, is_kept=True)
+    for changed in changed_stacks(edits):
+        again = rendered(*changed).indirect_edited
+        np.testing.assert_array_equal(kept.replay.edited(previews()[0].field(*changed)), again)
+        assert (again != kept.indirect).any()
+
+
+def test_a_changed_mask_replays_as_it_renders():
+    kept = rendered(*BRUSHED, is_kept=True)
+    changed = (brushed("/a", "scale", (3.0, 0.5, 2.0), 9), *BRUSHED[1:])
+    replayed = kept.replay.edited(previews()[0].field(*changed))
+    assert (replayed != kept.indirect_edited).any()
+    np.testing.assert_array_equal(replayed, rendered(*changed).indirect_edited)
+
+
+@pytest.mark.parametrize("edits", [BRUSHED, (rows(),)], ids=["brushes", "rows"])
+def test_rays_are_not_looked_at_again_for_a_changed_amount(edits, monkeypatch):
+    kept = rendered(*edits, is_kept=True)
+
+    def refuse(*_, **__):
+        raise AssertionError("rays were looked at")
+
+    monkeypatch.setattr("icheat_usd.kernels.painted_sums.painted_sums", refuse)
+    monkeypatch.setattr("icheat_usd.kernels.row_light.row_sums", refuse)
+    for changed in changed_stacks(edits)[:2]:
+        assert (kept.replay.edited(previews()[0].field(*changed)) != kept.indirect_edited).any()
 
 
 def overlapping_brushes(n: int) -> tuple[Edit, ...]:

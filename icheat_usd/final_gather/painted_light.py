@@ -1,0 +1,133 @@
+"""Light of cache records by the surface that it comes from, and by the painted masks on it.
+
+As `caster_light`, for stacks whose casters are painted with a few masks: replays look at no ray again.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from icheat_usd.final_gather.caster_light import list_of_casters, ray_table
+from icheat_usd.final_gather.hemispheres import Hemispheres
+from icheat_usd.kernels import painted_sums as kernels
+from icheat_usd.kernels.mask_table import MaskTable
+from icheat_usd.scene import F32, I32, I64, Bool, Geometry
+
+#: Stacks of masks whose light is kept for others.
+_MOST_KEPT = 4
+
+
+class _Entries(NamedTuple):
+    """Light of pairs of a record and a caster."""
+
+    record: I64  #: (m,) ascending
+    caster: I32  #: (m,)
+    first: I64  #: (m + 1,) sums of each
+    values: F32  #: (n_sums, n_blocks, N_VALUES, 4)
+
+
+def is_of_few(casters: MaskTable) -> bool:
+    """Whether no caster has more painted masks than subsets are kept of."""
+    return bool((_numbers(_painted(casters)) <= kernels.MOST_PAINTED).all())
+
+
+def light_by_masks(of: Hemispheres, sent: F32, casters: MaskTable) -> LightByMasks:
+    """What is known of hemispheres when cells send `sent`, for stacks with these painted masks."""
+    painted, selected = _painted(casters), np.diff(casters.begin) > 0
+    for one in of.painted:
+        if one.is_of(sent, painted, selected):
+            return one
+    found = LightByMasks(sent, painted, selected, of.n)
+    of.painted[:] = [*of.painted[1 - _MOST_KEPT :], found]
+    return found
+
+
+def bits(casters: MaskTable) -> I64:
+    """Number of each entry among the painted masks of its caster, -1 where it is not painted."""
+    is_painted = casters.mask >= 0
+    before = np.concatenate([[0], np.cumsum(is_painted)])
+    own = np.repeat(before[casters.begin[:-1]], np.diff(casters.begin))
+    return np.where(is_painted, before[:-1] - own, -1)
+
+
+class LightByMasks:
+    """Light of n records by caster and subset of its painted masks, found when it is first asked for."""
+
+    def __init__(self, sent: F32, painted: MaskTable, selected: Bool, n: int) -> None:
+        self._sent, self._painted, self._selected = sent, painted, selected
+        self._is_known = np.zeros(n, np.bool_)
+        empty = np.empty((0, sent.shape[1], kernels.N_VALUES, 4), np.float32)
+        self.entries = _Entries(np.empty(0, np.int64), np.empty(0, np.int32), np.zeros(1, np.int64), empty)
+        self.begin = np.zeros(n + 1, np.int64)  #: entries of each record
+
+    def is_of(self, sent: F32, painted: MaskTable, selected: Bool) -> bool:
+        """Whether it tells of these cells, painted masks and casters."""
+        if not (np.array_equal(self._selected, selected) and np.array_equal(self._sent, sent)):
+            return False
+        # Which row of a stack a mask belongs to does not matter.
+        names = [name for name in MaskTable._fields if name != "row"]
+        return all(np.array_equal(getattr(self._painted, name), getattr(painted, name)) for name in names)
+
+    def find(self, of: Hemispheres, geometry: Geometry, needed: Bool) -> None:
+        """See to it that some records are known."""
+        new = needed & ~self._is_known
+        if not new.any():
+            return
+        self._is_known |= new
+        share = of.shares()
+        number = 1 << _numbers(self._painted)
+        records, casters, values = [self.entries.record], [self.entries.caster], [self.entries.values]
+        for rays, _, owner in of.chunks():
+            some = new[owner]
+            if not some.any():
+                continue
+            table = ray_table(rays)
+            row, caster, local, begin = list_of_casters(rays, table, self._selected, some)
+            first = np.concatenate([[0], np.cumsum(number[caster])])
+            light = np.zeros((int(first[-1]), *self.entries.values.shape[1:]), np.float32)
+            kernels.painted_sums(
+                table,
+                geometry.face,
+                geometry.face_uv,
+                self._sent,
+                local,
+                begin,
+                first,
+                caster,
+                share[owner],
+                self._painted,
+                rays.seed,
+                rays.n_theta,
+                rays.n_phi,
+                light,
+            )
+            records.append(owner[row])
+            casters.append(caster)
+            values.append(light)
+        record, caster = np.concatenate(records), np.concatenate(casters)
+        order = np.argsort(record, kind="stable")
+        size = number[caster]
+        first = np.cumsum(size[order]) - size[order]
+        old = (np.cumsum(size) - size)[order]
+        where = np.repeat(old - first, size[order]) + np.arange(int(size.sum()))
+        self.entries = _Entries(
+            record[order],
+            caster[order],
+            np.append(first, len(where)),
+            np.take(np.concatenate(values), where, axis=0),
+        )
+        self.begin = np.searchsorted(self.entries.record, np.arange(of.n + 1))
+
+
+def _painted(casters: MaskTable) -> MaskTable:
+    """Painted entries alone."""
+    some = casters.mask >= 0
+    begin = np.concatenate([[0], np.cumsum(some)])[casters.begin]
+    columns = {name: getattr(casters, name)[some] for name in ("row", "weight", "mask", "first_face")}
+    return casters._replace(begin=begin, **columns)
+
+
+def _numbers(painted: MaskTable) -> I64:
+    return np.diff(painted.begin)

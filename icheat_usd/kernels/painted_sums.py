@@ -1,0 +1,242 @@
+"""Light of cache records by caster and by what the painted masks on it leave of it: all that amounts do not change.
+
+What a stack of edits makes of a pair is a polynomial of the weights of its painted masks, of no more than the first
+degree in each. So of a caster with k of them, the light times the weights of each of their 2^k subsets tells all that
+any amounts and colours, and any masks of receivers, make of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.caster_sums import N_VALUES, add_weighted, ray_weights, turn_to_world
+from icheat_usd.kernels.record_rays import turn_of
+from icheat_usd.kernels.simd import (
+    address_of,
+    color_add,
+    color_product,
+    load_color,
+    load_rgb,
+    scaled,
+    store_color,
+)
+from icheat_usd.kernels.texels import corner_texels, texel_weight
+
+#: Painted masks on one caster; with more, there are more subsets than it takes to look at the rays again.
+MOST_PAINTED = 3
+
+
+@parallel_kernel
+def painted_sums(  # type: ignore[no-untyped-def]
+    rays, face, face_uv, sent, local, begin, first, caster, share, painted, seed, n_theta, n_phi, out
+):
+    """`caster_sums.caster_sums` times the weights of subsets of painted masks.
+
+    Parameters
+    ----------
+    face : (n_triangles,) int32, face_uv : (n_triangles, 3, 2) float32
+        Control faces, and places of corners in them.
+    sent, local, share : as of `caster_sums`
+    begin : (n + 1,) int64
+        Entries of each hemisphere, one for each caster.
+    first : (m + 1,) int64
+        Sums of each entry: subset A, a number with a bit for each mask of the caster, is ``first[e] + A``.
+    caster : (m,) int32
+    painted : MaskTable
+        Painted masks on each caster, no more than `MOST_PAINTED`, and nothing else.
+    out : (n_sums, n_blocks, N_VALUES, 4) float32, out, zero before
+    """
+    for r in prange(len(begin) - 1):
+        if begin[r] < begin[r + 1]:
+            turn = turn_of(seed, rays.stream[r])
+            _sums_of_row(
+                r,
+                rays,
+                face,
+                face_uv,
+                sent,
+                local,
+                begin[r],
+                begin[r + 1],
+                first,
+                caster,
+                share[r],
+                painted,
+                turn,
+                n_theta,
+                n_phi,
+                out,
+            )
+
+
+@kernel
+def _sums_of_row(  # type: ignore[no-untyped-def]
+    r,
+    rays,
+    face,
+    face_uv,
+    sent,
+    local,
+    begin,
+    end,
+    first,
+    caster,
+    factor,
+    painted,
+    first_turn,
+    n_theta,
+    n_phi,
+    out,
+):
+    cell, adjusted_ray, detour = rays.cell, rays.adjusted, rays.detour
+    triangle, uv, end_face, end_face_uv = rays.triangle, rays.uv, rays.end_face, rays.end_face_uv
+    n_rays, n_blocks = cell.shape[1], sent.shape[1]
+    weights = np.empty((n_rays, 4), np.float32)
+    ray_weights(rays.distance, r, first_turn, n_theta, n_phi, factor, weights)
+    sums = np.zeros((first[end] - first[begin], n_blocks, 5, 4), np.float32)
+    sums_0, sent_0, throughput_0 = address_of(sums), address_of(sent), address_of(rays.throughput)
+    share = np.float32(np.pi / n_rays * factor)
+    adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
+    d, d_end = rays.detour_begin[r], rays.detour_begin[r + 1]
+    mask_begin, mask_weight, mask, first_face = painted.begin, painted.weight, painted.mask, painted.first_face
+    texels, texel_begin, resolution = painted.texels, painted.texel_begin, painted.resolution
+    product = np.ones(1 << MOST_PAINTED, np.float32)
+    for ray in range(n_rays):
+        is_adjusted = adjusted < adjusted_end and adjusted_ray[adjusted] == r * n_rays + ray
+        if is_adjusted:
+            adjusted += 1
+        is_detour = d < d_end and detour[d] == r * n_rays + ray
+        if is_detour:
+            d += 1
+        place = np.int64(local[r, ray])
+        if place < 0:
+            continue
+        i = np.int64(caster[begin + place])
+        n = 1
+        if mask_begin[i] < mask_begin[i + 1]:
+            if is_detour:
+                own_face = np.int64(end_face[d - 1])
+                at_s, at_t = end_face_uv[d - 1, 0], end_face_uv[d - 1, 1]
+            else:
+                hit = triangle[r, ray]
+                own_face = np.int64(face[hit])
+                v, w = uv[r, ray, 0], uv[r, ray, 1]
+                u = np.float32(1.0) - v - w
+                at_s = u * face_uv[hit, 0, 0] + v * face_uv[hit, 1, 0] + w * face_uv[hit, 2, 0]
+                at_t = u * face_uv[hit, 0, 1] + v * face_uv[hit, 1, 1] + w * face_uv[hit, 2, 1]
+            last, corners = np.int64(1), corner_texels(np.int64(1), at_s, at_t)
+            for e in range(mask_begin[i], mask_begin[i + 1]):
+                size = resolution[mask[e]]
+                if size != last:
+                    last, corners = size, corner_texels(size, at_s, at_t)
+                texel = texel_begin[mask[e]] + (first_face[e] + own_face) * size * size
+                own = mask_weight[e] * texel_weight(texels, texel, corners)
+                for subset in range(n):
+                    product[n + subset] = product[subset] * own
+                n *= 2
+        base = first[begin + place] - first[begin]
+        for block in range(n_blocks):
+            light = load_color(sent_0 + 16 * (np.int64(cell[r, ray]) * n_blocks + block))
+            if is_adjusted:
+                light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
+            for subset in range(n):
+                if product[subset] != np.float32(0.0):
+                    to = sums_0 + 80 * ((base + subset) * n_blocks + block)
+                    add_weighted(to, scaled(light, product[subset]), share, weights, ray)
+    nx, ny, nz = rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2]
+    for e in range(len(sums)):
+        for block in range(n_blocks):
+            turn_to_world(sums[e, block], nx, ny, nz, out[first[begin] + e, block])
+
+
+@parallel_kernel
+def stack_of_painted(begin, caster, first, light, bit, casters, stack, slots, records, values, derivative):  # type: ignore[no-untyped-def]
+    """Change of the light of slots, `stack_sums.stack_of_rays` from sums.
+
+    Parameters
+    ----------
+    begin : (n_records + 1,) int64, caster : (m,) int32, first : (m + 1,) int64
+    light : (n_sums, n_blocks, N_VALUES, 4) float32
+        As of `painted_sums`, by record.
+    bit : (n_entries,) int64
+        Of each entry of `casters` in the numbers of subsets, -1 where it is not painted.
+    casters, stack, slots : MaskTable, StackTable, SlotTable
+    records : (k,) int64
+        Records with slots.
+    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, 4) float32, out, zero before
+    """
+    for g in prange(len(records)):
+        _of_painted(records[g], begin, caster, first, light, bit, casters, stack, slots, values, derivative)
+
+
+@kernel
+def _of_painted(r, begin, caster, first, light, bit, casters, stack, slots, values, derivative):  # type: ignore[no-untyped-def]
+    n_most, n_blocks = 1 << MOST_PAINTED, stack.slope.shape[1]
+    before, found = np.zeros((n_most, 2, 4), np.float32), np.zeros((n_most, 2, 4), np.float32)
+    light_0, values_0, found_0 = address_of(light), address_of(values), address_of(found)
+    derivative_0 = address_of(derivative)
+    for e in range(begin[r], begin[r + 1]):
+        i, n = np.int64(caster[e]), first[e + 1] - first[e]
+        for s in range(slots.begin[r], slots.begin[r + 1]):
+            for block in range(n_blocks):
+                light_of_e = light_0 + 16 * N_VALUES * (first[e] * n_blocks + block)
+                _polynomial(i, s, block, -1, n, bit, casters, stack, slots, before, found)
+                for subset in range(n):
+                    change, at = load_color(found_0 + 32 * subset), light_of_e + 16 * N_VALUES * n_blocks * subset
+                    for v in range(N_VALUES):
+                        to = values_0 + 16 * (N_VALUES * s + v)
+                        store_color(to, color_add(change, load_color(at + 16 * v), load_color(to)))
+                if slots.derived[s] == slots.derived[s + 1]:
+                    continue
+                for k in range(casters.begin[i], casters.begin[i + 1]):
+                    row = np.int64(casters.row[k])
+                    place = np.int64(slots.place[slots.pattern[s], row])
+                    if place < 0:
+                        continue
+                    _polynomial(i, s, block, row, n, bit, casters, stack, slots, before, found)
+                    to = derivative_0 + 16 * (slots.derived[s] + place)
+                    for subset in range(n):
+                        change, at = (
+                            load_color(found_0 + 32 * subset + 16),
+                            light_of_e + 16 * N_VALUES * n_blocks * subset,
+                        )
+                        store_color(to, color_add(change, load_color(at), load_color(to)))
+
+
+@kernel
+def _polynomial(i, s, block, by, n, bit, casters, stack, slots, before, out):  # type: ignore[no-untyped-def]
+    """Change of a block of S or E by the edits on caster `i`, as factors of the `n` products of painted weights.
+
+    Beside it, its derivative by the receiver's mask of row `by`; ``before`` and ``out`` are (n, 2, 4).
+    """
+    masks, slope, shift, start = slots.masks, stack.slope, stack.shift, stack.start
+    for subset in range(n):
+        for c in range(3):
+            out[subset, 0, c] = out[subset, 1, c] = np.float32(0.0)
+    edit = -1
+    for k in range(casters.begin[i], casters.begin[i + 1]):
+        row = casters.row[k]
+        if masks[s, row] == np.float32(0.0) and row != by:
+            continue
+        if stack.edit[row] != edit:
+            # Keys of one edit all meet what weaker edits have left.
+            edit = stack.edit[row]
+            for subset in range(n):
+                for c in range(3):
+                    before[subset, 0, c], before[subset, 1, c] = out[subset, 0, c], out[subset, 1, c]
+        step, weight = np.int64(0), casters.weight[k]
+        if bit[k] >= 0:
+            step, weight = np.int64(1) << bit[k], np.float32(1.0)
+        inside, own = weight * masks[s, row], weight if row == by else np.float32(0.0)
+        for c in range(3):
+            a, b = slope[row, block, c], shift[row, block, c]
+            out[step, 0, c] += inside * b
+            out[step, 1, c] += own * b
+            for subset in range(n):
+                if subset & step:
+                    continue
+                met = before[subset, 0, c] + (start[block, c] if subset == 0 else np.float32(0.0))
+                out[subset + step, 0, c] += inside * a * met
+                out[subset + step, 1, c] += inside * a * before[subset, 1, c] + own * a * met
