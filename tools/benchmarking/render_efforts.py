@@ -28,19 +28,19 @@ EFFORTS: dict[str, RenderEffort] = {
         16_384,
         64,
         2,
-        GatherSettings(1, light_samples=1, edge_samples=4, cache=CacheSettings(noise=0.05, least_reach=3.0)),
+        GatherSettings(1, light_samples=1, edge_samples=3, cache=CacheSettings(noise=0.05, least_reach=3.0)),
     ),
     "cached 1": _cached(
-        32_768, 64, 2, GatherSettings(1, light_samples=1, edge_samples=8, cache=CacheSettings(noise=0.03))
+        32_768, 64, 2, GatherSettings(1, light_samples=1, edge_samples=7, cache=CacheSettings(noise=0.03))
     ),
     "cached 2": _cached(
         65_536,
         64,
         4,
-        GatherSettings(1, light_samples=1, edge_samples=12, cache=CacheSettings(noise=0.02, coverage=0.8)),
+        GatherSettings(1, light_samples=1, edge_samples=15, cache=CacheSettings(noise=0.02, coverage=0.8)),
     ),
     "cached 3": _cached(
-        65_536, 128, 8, GatherSettings(2, light_samples=2, edge_samples=16, cache=CacheSettings(noise=0.0125))
+        65_536, 128, 8, GatherSettings(2, light_samples=2, edge_samples=14, cache=CacheSettings(noise=0.0125))
     ),
     "cached 4": _cached(
         131_072,
@@ -49,7 +49,7 @@ EFFORTS: dict[str, RenderEffort] = {
         GatherSettings(
             4,
             light_samples=2,
-            edge_samples=24,
+            edge_samples=28,
             cache=CacheSettings(n_theta=16, noise=0.006, least_reach=1.5, coverage=0.8),
         ),
     ),
