@@ -36,10 +36,11 @@ def is_of_few(casters: MaskTable) -> bool:
 def light_by_masks(of: Hemispheres, sent: F32, casters: MaskTable) -> LightByMasks:
     """What is known of hemispheres when cells send `sent`, for stacks with these painted masks."""
     painted, selected = _painted(casters), np.diff(casters.begin) > 0
+    least = int(len(painted.mask) == len(casters.mask))
     for one in of.painted:
-        if one.is_of(sent, painted, selected):
+        if one.is_of(sent, painted, selected, least):
             return one
-    found = LightByMasks(sent, painted, selected, of.n)
+    found = LightByMasks(sent, painted, selected, least, of.n)
     of.painted[:] = [*of.painted[1 - _MOST_KEPT :], found]
     return found
 
@@ -55,16 +56,16 @@ def bits(casters: MaskTable) -> I64:
 class LightByMasks:
     """Light of n records by caster and subset of its painted masks, found when it is first asked for."""
 
-    def __init__(self, sent: F32, painted: MaskTable, selected: Bool, n: int) -> None:
-        self._sent, self._painted, self._selected = sent, painted, selected
+    def __init__(self, sent: F32, painted: MaskTable, selected: Bool, least: int, n: int) -> None:
+        self._sent, self._painted, self._selected, self._least = sent, painted, selected, least
         self._is_known = np.zeros(n, np.bool_)
         empty = np.empty((0, sent.shape[1], kernels.N_VALUES, 4), np.float32)
         self.entries = _Entries(np.empty(0, np.int64), np.empty(0, np.int32), np.zeros(1, np.int64), empty)
         self.begin = np.zeros(n + 1, np.int64)  #: entries of each record
 
-    def is_of(self, sent: F32, painted: MaskTable, selected: Bool) -> bool:
-        """Whether it tells of these cells, painted masks and casters."""
-        if not (np.array_equal(self._selected, selected) and np.array_equal(self._sent, sent)):
+    def is_of(self, sent: F32, painted: MaskTable, selected: Bool, least: int) -> bool:
+        """Whether it tells of these cells, painted masks and casters, from the subset `least` on."""
+        if self._least > least or not (np.array_equal(self._selected, selected) and np.array_equal(self._sent, sent)):
             return False
         # Which row of a stack a mask belongs to does not matter.
         names = [name for name in MaskTable._fields if name != "row"]
@@ -98,6 +99,7 @@ class LightByMasks:
                 caster,
                 share[owner],
                 self._painted,
+                self._least,
                 rays.seed,
                 rays.n_theta,
                 rays.n_phi,

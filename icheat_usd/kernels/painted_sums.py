@@ -30,7 +30,7 @@ MOST_PAINTED = 3
 
 @parallel_kernel
 def painted_sums(  # type: ignore[no-untyped-def]
-    rays, face, face_uv, sent, local, begin, first, caster, share, painted, seed, n_theta, n_phi, out
+    rays, face, face_uv, sent, local, begin, first, caster, share, painted, least, seed, n_theta, n_phi, out
 ):
     """`caster_sums.caster_sums` times the weights of subsets of painted masks.
 
@@ -46,6 +46,8 @@ def painted_sums(  # type: ignore[no-untyped-def]
     caster : (m,) int32
     painted : MaskTable
         Painted masks on each caster, no more than `MOST_PAINTED`, and nothing else.
+    least : int
+        1 to leave out the light itself, which no edit asks for that is painted.
     out : (n_sums, n_blocks, N_VALUES, 4) float32, out, zero before
     """
     for r in prange(len(begin) - 1):
@@ -64,6 +66,7 @@ def painted_sums(  # type: ignore[no-untyped-def]
                 caster,
                 share[r],
                 painted,
+                least,
                 turn,
                 n_theta,
                 n_phi,
@@ -85,6 +88,7 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
     caster,
     factor,
     painted,
+    least,
     first_turn,
     n_theta,
     n_phi,
@@ -141,7 +145,7 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
             light = load_color(sent_0 + 16 * (np.int64(cell[r, ray]) * n_blocks + block))
             if is_adjusted:
                 light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
-            for subset in range(n):
+            for subset in range(least, n):
                 if product[subset] != np.float32(0.0):
                     to = sums_0 + 80 * ((base + subset) * n_blocks + block)
                     add_weighted(to, scaled(light, product[subset]), share, weights, ray)
