@@ -39,7 +39,7 @@ class _Slots(NamedTuple):
     pattern: I32  #: (n,)
     derived: I64  #: (n + 1,) derivatives of each
     values: F32  #: (n, N_VALUES, 4)
-    derivative: F32  #: (n_derivatives, 4)
+    derivative: F32  #: (n_derivatives, N_VALUES, 4)
 
 
 class MaskedRecords:
@@ -78,7 +78,7 @@ class MaskedRecords:
             np.empty(0, np.int32),
             np.zeros(1, np.int64),
             np.empty((0, stack_sums.N_VALUES, 4), np.float32),
-            np.empty((0, 4), np.float32),
+            np.empty((0, stack_sums.N_VALUES, 4), np.float32),
         )
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
@@ -227,9 +227,9 @@ class MaskedRecords:
         )
 
     def _evaluate(self, of: Hemispheres, record: I64, slots: stack_sums.SlotTable) -> tuple[F32, F32]:
-        """Changes of light, (n_slots, N_VALUES, 4), and derivatives, (n_derivatives, 4)."""
+        """Changes of light, (n_slots, N_VALUES, 4), and derivatives, (n_derivatives, N_VALUES, 4)."""
         values = np.zeros((len(record), stack_sums.N_VALUES, 4), np.float32)
-        derivative = np.zeros((int(slots.derived[-1]), 4), np.float32)
+        derivative = np.zeros((int(slots.derived[-1]), stack_sums.N_VALUES, 4), np.float32)
         needed = np.diff(slots.begin) > 0
         if self._by_rays:
             self._ray_by_ray(of, needed, slots, values, derivative)
@@ -261,7 +261,9 @@ class MaskedRecords:
                 values,
                 derivative,
             )
-        values[:, 4:] *= np.take(of.shrink, record)[:, None, None]
+        shrink = np.take(of.shrink, record)
+        values[:, 4:] *= shrink[:, None, None]
+        derivative[:, 4:] *= np.repeat(shrink, np.diff(slots.derived))[:, None, None]
         return values, derivative
 
     def _ray_by_ray(

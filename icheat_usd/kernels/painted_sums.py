@@ -169,7 +169,7 @@ def stack_of_painted(begin, caster, first, light, bit, casters, stack, slots, re
     casters, stack, slots : MaskTable, StackTable, SlotTable
     records : (k,) int64
         Records with slots.
-    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, 4) float32, out, zero before
+    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, N_VALUES, 4) float32, out, zero before
     """
     for g in prange(len(records)):
         _of_painted(records[g], begin, caster, first, light, bit, casters, stack, slots, values, derivative)
@@ -200,13 +200,13 @@ def _of_painted(r, begin, caster, first, light, bit, casters, stack, slots, valu
                     if place < 0:
                         continue
                     _polynomial(i, s, block, row, n, bit, casters, stack, slots, before, found)
-                    to = derivative_0 + 16 * (slots.derived[s] + place)
+                    own = derivative_0 + 16 * N_VALUES * (slots.derived[s] + place)
                     for subset in range(n):
-                        change, at = (
-                            load_color(found_0 + 32 * subset + 16),
-                            light_of_e + 16 * N_VALUES * n_blocks * subset,
-                        )
-                        store_color(to, color_add(change, load_color(at), load_color(to)))
+                        change = load_color(found_0 + 32 * subset + 16)
+                        at = light_of_e + 16 * N_VALUES * n_blocks * subset
+                        for v in range(N_VALUES):
+                            to = own + 16 * v
+                            store_color(to, color_add(change, load_color(at + 16 * v), load_color(to)))
 
 
 @kernel

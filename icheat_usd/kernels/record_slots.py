@@ -28,8 +28,6 @@ from icheat_usd.kernels.simd import (
 #: New slots of one record from one call, beyond which places take the nearest.
 MOST_SLOTS = 32
 
-_MOST_GROWTH = np.float32(8.0)  # of light between two masks, beyond which gradients do not follow
-
 
 @kernel
 def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-untyped-def]
@@ -272,7 +270,7 @@ def mix_slots(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, 4) float32
+    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, N_VALUES, 4) float32
     derived : (n_slots + 1,) int64
         Derivatives of each slot, by the rows ``soft_row[soft_begin[p]:soft_begin[p + 1]]`` of its pattern p.
     slot : (n_pairs,) int64
@@ -333,35 +331,34 @@ def _mix_at(  # type: ignore[no-untyped-def]
     out,
 ):
     values_0, derivative_0 = address_of(values), address_of(derivative)
-    zero, one = np.float32(0.0), np.float32(1.0)
+    zero = np.float32(0.0)
     total = color_of(zero, zero, zero)
     nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
     for k in range(count[p]):
         r, s, w = record[p, k], slot[first + k], weight[p, k]
         dx, dy, dz = position[p, 0] - at[r, 0], position[p, 1] - at[r, 1], position[p, 2] - at[r, 2]
         mx, my, mz = facing[r, 0], facing[r, 1], facing[r, 2]
+        tx, ty, tz = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
         own = values_0 + 16 * N_VALUES * s
-        total = scale_add(load_color(own), w, total)
-        largest = 0
-        for c in range(1, 3):
-            if abs(values[s, 0, c]) > abs(values[s, 0, largest]):
-                largest = c
-        moved = values[s, 0, largest]
+        total = scale_add(_at_place(own, tx, ty, tz, dx, dy, dz), w, total)
         if derived[s] < derived[s + 1]:
             pattern = slot_pattern[s]
             for e in range(soft_begin[pattern], soft_begin[pattern + 1]):
                 row = soft_row[e]
                 step = masks[column, row] - slot_masks[s, row]
-                d = derived[s] + e - soft_begin[pattern]
-                moved += step * derivative[d, largest]
-                total = scale_add(load_color(derivative_0 + 16 * d), w * step, total)
-        # How light changes from place to place grows with the masks as the light itself does, for one edit exactly.
-        if moved != values[s, 0, largest]:
-            w *= min(max(moved / values[s, 0, largest], zero), _MOST_GROWTH) if values[s, 0, largest] != zero else one
-        total = scale_add(load_color(own + 16), w * (my * nz - mz * ny), total)
-        total = scale_add(load_color(own + 32), w * (mz * nx - mx * nz), total)
-        total = scale_add(load_color(own + 48), w * (mx * ny - my * nx), total)
-        total = scale_add(load_color(own + 64), w * dx, total)
-        total = scale_add(load_color(own + 80), w * dy, total)
-        total = scale_add(load_color(own + 96), w * dz, total)
+                if step != zero:
+                    by = derivative_0 + 16 * N_VALUES * (derived[s] + e - soft_begin[pattern])
+                    total = scale_add(_at_place(by, tx, ty, tz, dx, dy, dz), w * step, total)
     store_rgb(address_of(out) + 12 * q, total)
+
+
+@kernel
+def _at_place(values, tx, ty, tz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Light at a place from the values (N_VALUES, 4) at an address: turned by t and moved by d from the record."""
+    total = load_color(values)
+    total = scale_add(load_color(values + 16), tx, total)
+    total = scale_add(load_color(values + 32), ty, total)
+    total = scale_add(load_color(values + 48), tz, total)
+    total = scale_add(load_color(values + 64), dx, total)
+    total = scale_add(load_color(values + 80), dy, total)
+    return scale_add(load_color(values + 96), dz, total)

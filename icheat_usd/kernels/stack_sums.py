@@ -70,6 +70,8 @@ class _Lines(NamedTuple):
     at_hit: NDArray[np.float32]  #: (n_rows,) weights where a ray ends
     past: NDArray[np.float32]  #: (n_rows, 4) x before each edit
     factor: NDArray[np.float32]  #: (n_rows, 4) what it was multiplied by
+    slope: NDArray[np.float32]  #: (n_rows, 4) derivative of the change by the receiver's mask of each
+    to: NDArray[np.int64]  #: (n_rows,) place of that among the slot's, -1 for none
     line: NDArray[np.float32]  #: (n_rows, n_blocks, 2, 4) slope and shift
     own: NDArray[np.float32]  #: (_HELD, n_slots, n_blocks, n_rows, 2, 4) slope and shift times the masks of each slot
 
@@ -92,6 +94,8 @@ def _no_lines(n_slots, stack):  # type: ignore[no-untyped-def]
         np.empty(n_rows, np.float32),
         np.empty((n_rows, 4), np.float32),
         np.empty((n_rows, 4), np.float32),
+        np.empty((n_rows, 4), np.float32),
+        np.empty(n_rows, np.int64),
         line,
         np.empty((_HELD, n_slots, n_blocks, n_rows, 2, 4), np.float32),
     )
@@ -155,24 +159,24 @@ def _composed(own_0, shifts, is_last, base, n, weight, start, past_0, factor_0):
 
 
 @kernel
-def _derive(line_0, step, row, place, pattern, is_last, base, n, weight, past_0, factor_0, light, out_0):  # type: ignore[no-untyped-def]
-    """Add the derivatives of a light's change by masks of the receiver, after `_composed`.
+def _derive(line_0, step, row, place, pattern, is_last, base, n, weight, past_0, factor_0, slope_0, to):  # type: ignore[no-untyped-def]
+    """Derivatives of a change by masks of the receiver, after `_composed`: where they belong, and at an address.
 
     `line_0` is the address of a block's slope in the first row, `step` the bytes from one row's to the next; `pattern`
     is where places of derivatives begin.
     """
-    after, before = light, light
+    one = color_of(np.float32(1.0), np.float32(1.0), np.float32(1.0))
+    after, before = one, one
     for k in range(n):
         q = n - 1 - k
         if is_last[base + q]:
             after = before
             before = color_product(after, load_color(factor_0 + 16 * q))
-        to = np.int64(place[pattern + row[base + q]])
-        if to >= 0:
+        to[q] = np.int64(place[pattern + row[base + q]])
+        if to[q] >= 0:
             line = line_0 + step * row[base + q]
             own = color_add(load_color(line), load_color(past_0 + 16 * q), load_color(line + 16))
-            to = out_0 + 16 * to
-            store_color(to, color_add(scaled(own, weight[q]), after, load_color(to)))
+            store_color(slope_0 + 16 * q, color_product(scaled(own, weight[q]), after))
 
 
 @parallel_kernel
@@ -186,7 +190,7 @@ def stack_of_casters(begin, caster, light, casters, stack, slots, records, value
     casters, stack, slots : MaskTable, StackTable, SlotTable
     records : (k,) int64
         Records with slots.
-    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, 4) float32, out, zero before
+    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, N_VALUES, 4) float32, out, zero before
     """
     for g in prange(len(records)):
         _of_casters(records[g], begin, caster, light, casters, stack, slots, values, derivative)
@@ -200,6 +204,7 @@ def _of_casters(r, begin, caster, light, casters, stack, slots, values, derivati
     number, is_last, row, on_caster = lines.number, lines.is_last, lines.row, lines.weight
     place, weight = slots.place.reshape(-1), lines.at_hit
     past_0, factor_0 = address_of(lines.past), address_of(lines.factor)
+    slope_0, to_place = address_of(lines.slope), lines.to
     own_0, line_0 = address_of(lines.own), address_of(lines.line)
     shifts = _has_shifts(stack)
     light_0, values_0, start_0 = address_of(light), address_of(values), address_of(stack.start)
@@ -233,9 +238,16 @@ def _of_casters(r, begin, caster, light, casters, stack, slots, values, derivati
                         weight,
                         past_0,
                         factor_0,
-                        load_color(at),
-                        derivative_0 + 16 * slots.derived[s],
+                        slope_0,
+                        to_place,
                     )
+                    for q in range(n):
+                        if to_place[q] >= 0:
+                            slope = load_color(slope_0 + 16 * q)
+                            own = derivative_0 + 16 * N_VALUES * (slots.derived[s] + to_place[q])
+                            for v in range(N_VALUES):
+                                to = own + 16 * v
+                                store_color(to, color_add(slope, load_color(at + 16 * v), load_color(to)))
 
 
 @parallel_kernel
@@ -274,7 +286,7 @@ def stack_of_rays(  # type: ignore[no-untyped-def]
     share : (n_records,) float32
         Factor on the hemispheres of each record.
     casters, stack, slots : MaskTable, StackTable, SlotTable
-    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, 4) float32, out, added to
+    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, N_VALUES, 4) float32, out, added to
     """
     for g in prange(len(record)):
         for q in range(group[g], group[g + 1]):
@@ -329,11 +341,13 @@ def _of_rays(  # type: ignore[no-untyped-def]
     texels, weight = casters.texels, lines.at_hit
     place, pattern, derived = slots.place.reshape(-1), slots.pattern, slots.derived
     past_0, factor_0 = address_of(lines.past), address_of(lines.factor)
+    slope_0, to_place = address_of(lines.slope), lines.to
     own_0, line_0 = address_of(lines.own), address_of(lines.line)
     shifts = _has_shifts(stack)
     sums = np.zeros((n_slots, 5, 4), np.float32)
     sums_0, sent_0, throughput_0 = address_of(sums), address_of(sent), address_of(rays.throughput)
-    start_0, derivative_0 = address_of(stack.start), address_of(derivative)
+    slopes = np.zeros((derived[end] - derived[first], 5, 4), np.float32)
+    start_0, slopes_0 = address_of(stack.start), address_of(slopes)
     cell, instance, triangle, uv = rays.cell, rays.instance, rays.triangle, rays.uv
     detour, end_instance, end_face, end_face_uv = rays.detour, rays.end_instance, rays.end_face, rays.end_face_uv
     share = np.float32(np.pi / n_rays * factor)
@@ -401,9 +415,16 @@ def _of_rays(  # type: ignore[no-untyped-def]
                         weight,
                         past_0,
                         factor_0,
-                        scaled(light, share),
-                        derivative_0 + 16 * derived[first + s],
+                        slope_0,
+                        to_place,
                     )
+                    for q in range(n):
+                        if to_place[q] >= 0:
+                            to = slopes_0 + 80 * (derived[first + s] - derived[first] + to_place[q])
+                            brought = color_product(load_color(slope_0 + 16 * q), light)
+                            add_weighted(to, brought, share, weights, ray)
     nx, ny, nz = rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2]
     for s in range(n_slots):
         turn_to_world(sums[s], nx, ny, nz, values[first + s])
+    for k in range(len(slopes)):
+        turn_to_world(slopes[k], nx, ny, nz, derivative[derived[first] + k])
