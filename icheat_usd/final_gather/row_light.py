@@ -19,7 +19,7 @@ from icheat_usd.final_gather.irradiance_cache import Lookup
 from icheat_usd.final_gather.receiver_sets import Touched, mixtures_of
 from icheat_usd.final_gather.row_hemispheres import Collected, collect
 from icheat_usd.final_gather.row_stack import RowStack
-from icheat_usd.kernels import record_mixtures
+from icheat_usd.kernels import record_mixtures, row_mixing
 from icheat_usd.kernels import row_light as kernels
 from icheat_usd.kernels.row_sites import NEIGHBOURS
 from icheat_usd.materials import concatenate_points, take_points
@@ -91,11 +91,11 @@ class RowLight:
             np.zeros((0, n, NEIGHBOURS), np.int32),
             np.zeros((0, n, NEIGHBOURS), np.float32),
         )
-        self._bases = np.zeros((0, kernels.LANES), np.float32)
-        self._lists = kernels.Lists(np.zeros((0, n), np.int32), *(np.full(1 << 12, -1, np.int32) for _ in range(2)))
+        self._bases = np.zeros((0, row_mixing.LANES), np.float32)
+        self._lists = row_mixing.Lists(np.zeros((0, n), np.int32), *(np.full(1 << 12, -1, np.int32) for _ in range(2)))
         self._base_of, self._payload_of = (np.zeros(1 << 12, np.int32) for _ in range(2))
         self._n = 0
-        self._sums = np.zeros((0, kernels.LANES), np.float32)
+        self._sums = np.zeros((0, row_mixing.LANES), np.float32)
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
         """Change of irradiance at m receivers with records, (m, 3); `found` is of all points."""
@@ -109,7 +109,7 @@ class RowLight:
         if not any(asked.is_like(one) for one in self._listed):
             self._enter(asked, active, weights)
         out = np.empty((len(where), 3), np.float32)
-        kernels.mix_rows(
+        row_mixing.mix_rows(
             self._position,
             self._normal,
             points.position,
@@ -198,7 +198,7 @@ class RowLight:
         self._record, self._set = np.concatenate([self._record, record]), np.concatenate([self._set, one])
         self._own_row = np.concatenate([self._own_row, row])
         self._own_weight = np.concatenate([self._own_weight, weight])
-        self._bases = np.concatenate([self._bases, np.zeros((n, kernels.LANES), np.float32)])
+        self._bases = np.concatenate([self._bases, np.zeros((n, row_mixing.LANES), np.float32)])
         head = np.concatenate([self._lists.head, np.full((n, len(self._rows)), -1, np.int32)])
         self._lists = self._lists._replace(head=head)
 
@@ -215,17 +215,17 @@ class RowLight:
         return take_points(concatenate_points(*parts), np.argsort(np.concatenate(owners), kind="stable"))
 
     def _list(self, *asked: Any) -> None:
-        """Enter sums that are not there yet; arguments of `kernels.list_sums` from `count` on."""
+        """Enter sums that are not there yet; arguments of `row_mixing.list_sums` from `count` on."""
         places, at = asked[:6], asked[6:]
         done, n = 0, self._n
         while True:
             given: Any = (done, *places, self._slot, *at, self._lists, self._base_of, self._payload_of, n)
-            done, n = kernels.list_sums(*given)
+            done, n = row_mixing.list_sums(*given)
             if done == len(at[-1]):
                 break
             more = np.full(max(len(self._base_of), 1 << 16), -1, np.int32)
             following, row = (np.concatenate([column, more]) for column in self._lists[1:])
-            self._lists = kernels.Lists(self._lists.head, following, row)
+            self._lists = row_mixing.Lists(self._lists.head, following, row)
             self._base_of = np.concatenate([self._base_of, more])
             self._payload_of = np.concatenate([self._payload_of, more])
         self._n = n
@@ -235,7 +235,7 @@ class RowLight:
     def _sum(self, first_base: int, first_sum: int) -> None:
         """Sums from `first_sum` on, and light at the records of bases from `first_base` on."""
         n = self._n - first_sum
-        self._sums = np.concatenate([self._sums, np.zeros((n, kernels.LANES), np.float32)])
+        self._sums = np.concatenate([self._sums, np.zeros((n, row_mixing.LANES), np.float32)])
         base_of, payload_of = (
             column[first_sum : self._n].astype(np.int64) for column in (self._base_of, self._payload_of)
         )
@@ -260,8 +260,8 @@ class RowLight:
             own = self._own_row[some].astype(np.int64)
             own[self._own_weight[some] == 0] = -1
             decoded, at, own_at = self._decode(payload_of[mine], row[mine], own)
-            light = np.empty((len(some), kernels.LANES), np.float32)
-            sums = np.empty((len(mine), kernels.LANES), np.float32)
+            light = np.empty((len(some), row_mixing.LANES), np.float32)
+            sums = np.empty((len(mine), row_mixing.LANES), np.float32)
             first = self._hemispheres.parts[0].rays
             kernels.row_sums(
                 rays.table,
@@ -287,7 +287,7 @@ class RowLight:
             self._sums[first_sum + mine] = sums
             self._bases[some[is_new[some]]] = light[is_new[some]]
         new = np.flatnonzero(has_own & is_new)
-        kernels.take_own(self._lists, new, self._own_row[new], self._own_weight[new], self._sums, self._bases)
+        row_mixing.take_own(self._lists, new, self._own_row[new], self._own_weight[new], self._sums, self._bases)
 
     def _decode(self, payload: I64, row: I64, own: I64) -> tuple[F32, I64, I64]:
         """Rows, one after another, and where those of sums and of records (n, n_payloads, 4) begin; -1 for none."""
