@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from icheat_usd.final_gather.irradiance_cache import Places
 from icheat_usd.kernels import near_surfaces as kernels
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.samples import cosine_rays
@@ -13,14 +12,6 @@ from icheat_usd.scene import F32, I64, Camera, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, spawn_points
 
 _RAYS = 4  # of each pixel: in a narrow gap any of them meets its other side
-
-
-def places_of(
-    snapshot: SceneSnapshot, tracer: Tracer, view: ViewSamples, seed: int, most_reach: float = np.inf
-) -> Places:
-    """The places of view samples; see `near_of`."""
-    near = near_of(snapshot, tracer, view, seed, most_reach)
-    return Places(view.points, pixel_extent(snapshot.camera, view), near)
 
 
 def near_of(snapshot: SceneSnapshot, tracer: Tracer, view: ViewSamples, seed: int, most_reach: float = np.inf) -> F32:

@@ -10,8 +10,8 @@ import pytest
 
 from icheat_usd.edits.model import Edit, KeyedPayload, MaskedSurface, Payload, SurfaceMask
 from icheat_usd.final_gather import CacheSettings
-from icheat_usd.final_gather.irradiance_cache import IrradianceCache, overture
-from icheat_usd.final_gather.places import places_of
+from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Places, overture
+from icheat_usd.final_gather.places import near_of, pixel_extent
 from icheat_usd.final_gather.record_rays import HemisphereTracer
 from icheat_usd.kernels.irradiance_cache import MAX_ENTRIES
 from icheat_usd.materials import points_on_surface
@@ -37,7 +37,8 @@ class Built:
             snapshot, self.tracer, self.gather, settings.n_theta, settings.n_phi, seed=5
         )
         self.cache = IrradianceCache(self.hemispheres, cells, settings)
-        self.places = places_of(snapshot, self.tracer, self.view, seed=1)
+        near = near_of(snapshot, self.tracer, self.view, seed=1)
+        self.places = Places(self.view.points, pixel_extent(snapshot.camera, self.view), near)
         overture(self.cache, self.places, self.view.pixel, snapshot.camera.width)
 
     def irradiance(self, which=slice(None)):
