@@ -46,9 +46,15 @@ class _Listed(NamedTuple):
 
     def is_like(self, other: _Listed) -> bool:
         """Whether these places ask for the same sums."""
-        if self.found is not other.found:
-            return False
-        return all(np.array_equal(one, two) for one, two in zip(self[1:], other[1:], strict=True))
+        return (
+            self.found is other.found
+            and self.is_used == other.is_used
+            and np.array_equal(self.where, other.where)
+            and np.array_equal(self.which, other.which)
+            and np.array_equal(self.begin, other.begin)
+            and np.array_equal(self.entry, other.entry)
+            and np.array_equal(self.rows, other.rows)
+        )
 
 
 def row_light(gatherer: Gatherer, hemispheres: Hemispheres, position: F32, normal: F32) -> RowLight:
