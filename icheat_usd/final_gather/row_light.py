@@ -48,12 +48,12 @@ class _Listed(NamedTuple):
         """Whether these places ask for the same sums."""
         return (
             self.found is other.found
-            and self.is_used == other.is_used
             and np.array_equal(self.where, other.where)
             and np.array_equal(self.which, other.which)
             and np.array_equal(self.begin, other.begin)
             and np.array_equal(self.entry, other.entry)
             and np.array_equal(self.rows, other.rows)
+            and np.array_equal(self.is_used, other.is_used)
         )
 
 
