@@ -79,8 +79,14 @@ def at_least_0(text: str) -> int:
 
 def command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.sequence import render_frames
+    from icheat_usd.errors import SettingsError
     from icheat_usd.session import GatherSettings
 
+    if options.method == "brute":
+        of_cached = {"--noise": options.noise, "--edge-samples": options.edge_samples}
+        wrong = [name for name, value in of_cached.items() if value is not None]
+        if wrong:
+            raise SettingsError(f"the brute method has no use for {', '.join(wrong)}; leave that out, or the method")
     given = {
         "samples_per_pixel": options.samples,
         "gather_rays": options.rays,

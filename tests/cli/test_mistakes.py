@@ -175,3 +175,13 @@ def test_keys_say_why_by_default_as_edits_do(shot: Path, capsys: pytest.CaptureF
     assert main(["history", str(shot), "warm", "--json"]) == 0
     whys = [event["why"] for event in json.loads(capsys.readouterr().out)["events"]]
     assert "hotter" in whys and any(why.startswith("icheat ") for why in whys)
+
+
+@pytest.mark.parametrize("words", [["--noise", "0.1"], ["--edge-samples", "0"]])
+def test_what_only_cached_light_has_is_no_option_of_the_brute_method(
+    shot: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files(shot.parent)
+    assert main(["render", str(shot), "-o", str(shot.parent / "f.exr"), "--method", "brute", *words]) == 2
+    assert f"no use for {words[0]}; leave that out" in capsys.readouterr().err
+    assert files(shot.parent) == before
