@@ -18,7 +18,9 @@ from icheat_usd.kernels.guide import (
     sphere_direction,
     warp,
 )
-from icheat_usd.kernels.lights import hit_shape, light_shape, mesh_pdf, sample_mesh, sample_shape
+from icheat_usd.kernels.light_hits import hit_shape
+from icheat_usd.kernels.light_triangles import mesh_pdf, sample_mesh
+from icheat_usd.kernels.lights import light_shape, sample_shape
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 from icheat_usd.kernels.vector import row3
 

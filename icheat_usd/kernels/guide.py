@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.environment import F32, F64, Floats, Table, dome_image_numbers, search_cdf
-from icheat_usd.kernels.lights import light_shape, linear_map, normalized, sample_shape
+from icheat_usd.kernels.light_geometry import linear_map, normalized
+from icheat_usd.kernels.lights import light_shape, sample_shape
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
 
 I32 = NDArray[np.int32]

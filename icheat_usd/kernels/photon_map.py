@@ -10,7 +10,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.lights import orthonormal_basis
+from icheat_usd.kernels.light_geometry import orthonormal_basis
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 
 LEAF = 8  #: photons of a leaf, scanned one by one

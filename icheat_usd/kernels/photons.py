@@ -9,10 +9,18 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.environment import F32, F64, Floats, Table, image_bilinear, search_cdf
-from icheat_usd.kernels.lights import light_shape, linear_map, normalized, orthonormal_basis, sample_shape
+from icheat_usd.kernels.light_geometry import (
+    DISK,
+    DISTANT,
+    DOME,
+    RECT,
+    SPHERE,
+    linear_map,
+    normalized,
+    orthonormal_basis,
+)
+from icheat_usd.kernels.lights import light_shape, sample_shape
 from icheat_usd.kernels.random import hash_combine, sobol_pair, uniform
-
-_SPHERE, _DISK, _RECT, _CYLINDER, _DISTANT, _DOME = 0, 1, 2, 3, 4, 5
 
 #: Streams of random numbers.
 _PLACES, _DIRECTIONS, _SIDES, _CROSSINGS, _REFLECTIONS = 0x9E01, 0x9E02, 0x9E03, 0x9E04, 0x9E05
@@ -58,8 +66,8 @@ def _cofactor(m: Floats, x: float, y: float, z: float) -> Floats:
 @kernel
 def _place_on_shape(kind: int, m: Floats, a: float, b: float, u: float, v: float) -> Floats:
     """Place (3), unit normal of the shining side (3) and area per unit of (u, v); area 0 where there is none."""
-    if kind == _RECT or kind == _DISK:
-        if kind == _RECT:
+    if kind == RECT or kind == DISK:
+        if kind == RECT:
             x, y = (u - 0.5) * a, (v - 0.5) * b
             measure = a * b
         else:
@@ -70,7 +78,7 @@ def _place_on_shape(kind: int, m: Floats, a: float, b: float, u: float, v: float
         side = -1.0 if nx * m[2] + ny * m[6] + nz * m[10] >= 0.0 else 1.0
         nx, ny, nz = side * nx, side * ny, side * nz
         px, py, pz = linear_map(m, x, y, 0.0)
-    elif kind == _SPHERE:
+    elif kind == SPHERE:
         z = 1.0 - 2.0 * u
         r = math.sqrt(max(0.0, 1.0 - z * z))
         x, y = r * math.cos(2.0 * math.pi * v), r * math.sin(2.0 * math.pi * v)
@@ -126,13 +134,13 @@ def emit_from_shape(
         u, v = sobol_pair(first + i, places)
         s, t = sobol_pair(first + i, directions)
         u, v, s, t = float(u), float(v), float(s), float(t)
-        if kind == _DISTANT:
+        if kind == DISTANT:
             u, v, aim, cell[i] = _aimed(rows, cells, u, v)
         else:
             s, t, aim, cell[i] = _aimed(rows, cells, s, t)
         red, green, blue = 1.0, 1.0, 1.0
-        if kind == _DISTANT or kind == _DOME:
-            if kind == _DOME and image[0] < 0:
+        if kind == DISTANT or kind == DOME:
+            if kind == DOME and image[0] < 0:
                 wz = 1.0 - 2.0 * s
                 r = math.sqrt(max(0.0, 1.0 - wz * wz))
                 wx, wy, density = r * math.cos(2.0 * math.pi * t), r * math.sin(2.0 * math.pi * t), 0.25 / math.pi
@@ -152,7 +160,7 @@ def emit_from_shape(
             weight = math.pi * area
             wx, wy, wz = _cosine_about(nx, ny, nz, s, t)
             px, py, pz = px + clearance * wx, py + clearance * wy, pz + clearance * wz
-            if kind == _RECT and image[0] >= 0:
+            if kind == RECT and image[0] >= 0:
                 # upright for who looks at its lit side
                 red, green, blue = image_bilinear(texels, image[0], image[1], image[2], 1.0 - u, 1.0 - v, False)
         weight /= n_total * aim

@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from icheat_usd.kernels.direct import meet_analytic
-from icheat_usd.kernels.lights import light_shape, sample_mesh, sample_shape
+from icheat_usd.kernels.light_triangles import sample_mesh
+from icheat_usd.kernels.lights import light_shape, sample_shape
 from icheat_usd.lighting import build_light_sampler, environment_radiance, irradiance, reflected_direct
 from icheat_usd.materials import evaluate
 from icheat_usd.scene import LightKind, SceneSnapshot, SurfacePoints
