@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,6 +93,11 @@ class BoundEdit:
     @property
     def n_keys(self) -> int:
         return len(self.key_weights)
+
+    @property
+    def at_full_amount(self) -> BoundEdit:
+        """The same edit with an amount of 1."""
+        return replace(self, edit=replace(self.edit, amount=1.0))
 
     @property
     def is_prepared(self) -> bool:

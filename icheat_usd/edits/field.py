@@ -113,7 +113,7 @@ class EditField:
                     located.append(rows.locate_receivers(points))
                     # Where no row holds nothing is edited, to the bit.
                     masks[-1] *= (located[-1].rows >= 0).any(axis=1)
-        return _ends(masks, located, points, self.uses_receiver)
+        return _ends(masks, located, points, self._is_asked_for_places())
 
     def casters(self, points: SurfacePoints) -> Ends:
         """The points as casters."""
@@ -124,7 +124,10 @@ class EditField:
                 if rows is not None:
                     located.append(rows.locate_casters(points))
                     masks[-1] *= located[-1] >= 0
-        return _ends(masks, located, points, self.uses_receiver or self.uses_caster)
+        return _ends(masks, located, points, self._is_asked_for_places() or self.uses_caster)
+
+    def _is_asked_for_places(self) -> bool:
+        return any(bound.operation is not None and bound.operation.uses_receiver for bound in self.edits)
 
     def receiver_masks(self, points: SurfacePoints) -> F32:
         """Soft receiver masks u alone, (n_rows, n)."""

@@ -7,25 +7,28 @@ change of its light for masks of 0 and 1 alone; what lies between is mixed at th
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from icheat_usd.edits.bound import Ends, weighted
-from icheat_usd.edits.field import EditField
 from icheat_usd.edits.mask_stack import is_of_masks
-from icheat_usd.edits.operations import PairEnd
 from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup, RecordValues
+from icheat_usd.final_gather.kept_changes import KeptChanges
 from icheat_usd.final_gather.masked_records import MaskedRecords
+from icheat_usd.final_gather.pair_tables import PairStack, PairSums, batches
 from icheat_usd.final_gather.receiver_sets import Mixtures, Touched, mixtures_of
-from icheat_usd.final_gather.record_rays import RecordRays, take_rays
+from icheat_usd.final_gather.record_pairs import RecordPairs
+from icheat_usd.final_gather.record_rays import take_rays
 from icheat_usd.final_gather.row_records import RowRecords
 from icheat_usd.final_gather.row_stack import is_of_rows
+from icheat_usd.final_gather.same_stack import same_but_amounts, same_values
 from icheat_usd.kernels import record_mixtures as kernels
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
 
-_STEP = 0.1  # of a record's reach, or radians: from how far beside a record a receiver's own part is looked at
+_MOST_KEPT = 2  #: stacks whose light is kept for others
 
 
 def edited_records(
@@ -34,11 +37,21 @@ def edited_records(
     """Changes that a gatherer's stack makes of the light of a cache's records."""
     if is_of_masks(gatherer.field):
         return MaskedRecords(gatherer, cache, hemispheres)
-    return (RowRecords if is_of_rows(gatherer.field) else EditedRecords)(gatherer, cache, hemispheres)
+    if is_of_rows(gatherer.field):
+        return RowRecords(gatherer, cache, hemispheres)
+    for one in hemispheres.of_pairs:
+        if one.take_amounts(gatherer):
+            return one
+    found = EditedRecords(gatherer, cache, hemispheres)
+    if hemispheres.is_kept:
+        hemispheres.of_pairs[:] = [*hemispheres.of_pairs[1 - _MOST_KEPT :], found]
+    return found
 
 
 class EditedRecords:
     """Changes of records' irradiance, found when a camera sample first asks for them.
+
+    Where one edit acts alone they are those of its full amount, which others are in proportion to.
 
     Parameters
     ----------
@@ -52,8 +65,23 @@ class EditedRecords:
     def __init__(self, gatherer: Gatherer, cache: IrradianceCache, hemispheres: Hemispheres) -> None:
         assert gatherer.solution is not None
         self._gatherer, self._cache, self._hemispheres = gatherer, cache, hemispheres
+        self._stack = PairStack(gatherer.field)
         self._slots: dict[bytes, I32] = {}
         self._values = _no_values(0)
+        self._changes = KeptChanges()
+
+    def take_amounts(self, gatherer: Gatherer) -> bool:
+        """Go on with another stack, if it differs in amounts alone."""
+        own, other = self._gatherer.solution, gatherer.solution
+        assert own is not None and other is not None
+        if gatherer.is_part != self._gatherer.is_part or not same_but_amounts(self._gatherer.field, gatherer.field):
+            return False
+        if not np.array_equal(own.b, other.b) or not same_values(own.sent, other.sent):
+            return False
+        self._gatherer, self._stack = gatherer, PairStack(gatherer.field)
+        known = {name: np.frombuffer(name, np.bool_) for name in self._slots}
+        self._slots = {name: self._slots[name] for name, is_in in known.items() if self._stack.alone(is_in) >= 0}
+        return True
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
         """Change of irradiance at m receivers with records.
@@ -68,8 +96,22 @@ class EditedRecords:
         -------
         (m, 3) float32
         """
-        cache, where, which = self._cache, receivers.where, receivers.which
         mixed = mixtures_of(receivers)
+        alone = np.array([self._stack.alone(is_in) for is_in in mixed.is_in], np.int64)
+        amount = np.append(self._stack.amounts, np.float32(1))[alone]
+        if (alone < 0).any():
+            weighed = mixed._replace(weight=mixed.weight * amount[mixed.entry])
+            return self._mix(found, points, receivers, weighed)
+        asked = (receivers.where, receivers.which, *mixed[1:], np.stack(mixed.is_in))
+        change = self._changes.find(found, asked)
+        if change is None:
+            change = self._mix(found, points, receivers, mixed)
+            if self._hemispheres.is_kept:
+                self._changes.keep(found, asked, change)
+        return change * amount[mixed.entry[mixed.begin[receivers.which]]][:, None]
+
+    def _mix(self, found: Lookup, points: SurfacePoints, receivers: Touched, mixed: Mixtures) -> F32:
+        cache, where, which = self._cache, receivers.where, receivers.which
         needed = np.zeros((len(mixed.is_in), cache.n), np.uint8)
         kernels.mark_records(found.number, found.record, where, which, mixed.begin, mixed.entry, needed)
         self._prepare(mixed, needed.view(np.bool_))
@@ -111,12 +153,39 @@ class EditedRecords:
             parts.append(_no_values(count))
             missing.append((is_in, needed, parts[-1]))
         if missing:
-            self._by_pairs(missing)
+            if self._gatherer.field.uses_incident:
+                self._by_pairs(missing)
+            else:
+                self._by_tables(missing)
         if len(parts) > 1:
             self._values = RecordValues(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
+    def _by_tables(self, missing: list[tuple[Bool, Bool, RecordValues]]) -> None:
+        """Changes of records: sets of edits, the records (n_records,) wanted in each, and their values."""
+        cache, hemispheres, stack = self._cache, self._hemispheres, self._stack
+        is_in = np.stack([one for one, _, _ in missing])
+        wanted = np.stack([needed for _, needed, _ in missing])
+        amounts = np.tile(stack.amounts, (len(missing), 1))
+        amounts[[stack.alone(one) >= 0 for one in is_in]] = 1
+        acts = np.ascontiguousarray(is_in[:, stack.rows], np.uint8)
+        share = hemispheres.shares()
+        for part in batches(hemispheres, np.asarray(wanted.any(axis=0), np.bool_)):
+            owner = part.owner
+            sums = PairSums(
+                self._gatherer, stack, part, cache.table.reach[owner], share[owner], hemispheres.shrink[owner]
+            )
+            for one, (_, needed, values) in enumerate(missing):
+                rows = np.flatnonzero(needed[owner])
+                if len(rows) == 0:
+                    continue
+                found = sums.values(rows, np.full(len(rows), one), acts, amounts)
+                place = (np.cumsum(needed) - 1)[owner[rows]]
+                for column, own in zip(values, found, strict=True):
+                    # One hemisphere after another, whichever batch it is in.
+                    np.add.at(column, place, own)
+
     def _by_pairs(self, missing: list[tuple[Bool, Bool, RecordValues]]) -> None:
-        """Changes of records ray by ray: sets of edits, the records (n_records,) wanted in each, and their values."""
+        """`_by_tables` where edits look at light: ray by ray."""
         cache, hemispheres = self._cache, self._hemispheres
         every = np.zeros(cache.n, np.bool_)
         for _, needed, _ in missing:
@@ -127,129 +196,26 @@ class EditedRecords:
             if len(some) == 0:
                 continue
             owner = owner[some]
-            pairs = RecordPairs(self._gatherer, take_rays(rays, some), take_points(points, some))
+            rays, points = take_rays(rays, some), take_points(points, some)
+            pairs: dict[bool, RecordPairs] = {}
             for is_in, needed, values in missing:
                 rows = np.flatnonzero(needed[owner])
                 if len(rows) == 0:
                     continue
-                found = pairs.values(rows, owner[rows], is_in, cache)
+                is_alone = self._stack.alone(is_in) >= 0
+                if is_alone not in pairs:
+                    pairs[is_alone] = RecordPairs(self._at_full_amounts() if is_alone else self._gatherer, rays, points)
+                found = pairs[is_alone].values(rows, owner[rows], is_in, cache)
                 place = (np.cumsum(needed) - 1)[owner[rows]]
                 for column, part in zip(values, found, strict=True):
                     part *= share[owner[rows]].reshape(-1, *(1,) * (part.ndim - 1))
                     # One hemisphere after another, whichever chunk it is in.
                     np.add.at(column, place, part)
 
+    def _at_full_amounts(self) -> Gatherer:
+        field = self._gatherer.field
+        return replace(self._gatherer, field=replace(field, edits=tuple(bound.at_full_amount for bound in field.edits)))
+
 
 def _no_values(n: int) -> RecordValues:
     return RecordValues(np.zeros((n, 3), np.float32), *(np.zeros((n, 3, 3), np.float32) for _ in range(2)))
-
-
-class RecordPairs:
-    """Rays of some records as pairs of their places and the casters that they end on."""
-
-    def __init__(self, gatherer: Gatherer, rays: RecordRays, points: SurfacePoints) -> None:
-        self._field = gatherer.field
-        assert gatherer.solution is not None
-        self._rays = rays
-        self._flat = np.flatnonzero(_may_send(self._field, rays.sender.reshape(-1)))
-        self._casters = self._field.casters(rays.ends(gatherer.snapshot, self._flat))
-        self._receivers = self._field.receivers(points)
-        self._located = _is_located(self._receivers, self._field)
-        self._b, self._sent = gatherer.solution.b, gatherer.solution.sent
-
-    def values(self, rows: I64, records: I64, is_in: Bool, cache: IrradianceCache) -> RecordValues:
-        """Changes of the irradiance of records `rows`, where receivers are in these edits, and their gradients.
-
-        `records` are their numbers in the cache.
-        """
-        masks = np.repeat(is_in.astype(np.float32)[:, None], len(self._rays.stream), axis=1)
-        some = take_rays(self._rays, rows)
-        values, _ = cache.sums(some, self.change(rows, masks))
-        values.by_move[...] *= np.take(cache.shrink, records)[:, None, None]
-        if not self._field.uses_receiver:
-            return values
-        # The gradients of hemispheres take what a pair brings as given. What it depends on the receiver is added, by
-        # looking from beside it, and from a turned surface, at the same casters.
-        place = self._receivers.place
-        assert place is not None
-        normal = place.normal
-        axis = np.eye(3, dtype=np.float32)[np.argmin(np.abs(normal), axis=1)]
-        first = np.cross(axis, normal)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        second = np.cross(normal, first)
-        step = _STEP * np.take(cache.table.reach, records)[:, None]
-        for tangent, axis in ((first, second), (second, -first)):
-            moved = (place.position + _spread(step, rows, len(normal)) * tangent).astype(np.float32)
-            turned = (normal + np.float32(_STEP) * tangent).astype(np.float32)
-            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-            for there, gradient, direction, size in (
-                (place._replace(position=moved), values.by_move, tangent, step),
-                (place._replace(normal=turned), values.by_turn, axis, np.float32(_STEP)),
-            ):
-                light, _ = cache.sums(some, self.change(rows, masks, there))
-                slope = (light.irradiance - values.irradiance) / size
-                gradient += slope[:, :, None] * direction[rows][:, None, :]
-        return values
-
-    def change(self, rows: I64, masks: F32, place: PairEnd | None = None) -> F32:
-        """Change of the light that rays of records `rows` bring, (k, n_rays, 3).
-
-        Parameters
-        ----------
-        masks : (n_rows, n) float32
-            Of all records as receivers.
-        place : PairEnd, optional
-            Where the receivers are taken to be.
-        """
-        rays = self._rays
-        inside = np.zeros(len(rays.stream), bool)
-        inside[rows] = True
-        row = self._flat // rays.n_rays
-        reached = inside[row] & ((masks != 0)[:, row] & (self._casters.masks != 0)).any(axis=0)
-        touched = np.flatnonzero(reached)
-        out = np.zeros((len(rays.stream), rays.n_rays, 3), np.float32)
-        if len(touched):
-            flat = self._flat[touched]
-            receivers = self._receivers._replace(masks=masks * self._located)
-            if place is not None:
-                receivers = receivers._replace(place=place)
-            seen = np.take(self._b, np.take(rays.cell.reshape(-1), flat), axis=1)
-            found = self._field.evaluate(seen, receivers.take(row[touched]), self._casters.take(touched))
-            if self._sent is None:
-                changed = found.light(seen) - seen.sum(axis=0)
-            else:
-                sent = np.take(self._sent, np.take(rays.cell.reshape(-1), flat), axis=1)
-                changed = weighted(found.scale, sent) - sent.sum(axis=0)
-            if len(rays.adjusted):
-                entry = np.minimum(np.searchsorted(rays.adjusted, flat), len(rays.adjusted) - 1)
-                went = rays.adjusted[entry] == flat
-                changed[went] *= rays.throughput[entry[went]]
-            out.reshape(-1, 3)[flat] = changed
-        return out[rows]
-
-
-def _may_send(field: EditField, instance: I32) -> Bool:
-    """(n,) whether an edit may have casters on these instances, -1 for none."""
-    weights = [casters.on_instances for bound in field.edits for casters in bound.casters]
-    selected = np.append(np.stack(weights).any(axis=0), False)
-    return np.take(selected, instance)
-
-
-def _spread(values: F32, rows: I64, n: int) -> F32:
-    """(k, 1) values of some rows among n, 0 elsewhere."""
-    out = np.zeros((n, 1), np.float32)
-    out[rows] = values
-    return out
-
-
-def _is_located(receivers: Ends, field: EditField) -> F32:
-    """(n_rows, n) 0 where sampled rows have none for the receiver, 1 elsewhere and for all other payloads."""
-    located = np.ones((field.n_rows, receivers.masks.shape[1]), np.float32)
-    row = entry = 0
-    for bound in field.edits:
-        for rows in bound.rows:
-            if rows is not None:
-                located[row] = (receivers.located[entry].rows >= 0).any(axis=1)
-                entry += 1
-            row += 1
-    return located

@@ -14,6 +14,7 @@ from icheat_usd.scene import F32, I64, SurfacePoints
 
 if TYPE_CHECKING:
     from icheat_usd.final_gather.caster_light import LightByCaster
+    from icheat_usd.final_gather.edited_records import EditedRecords
     from icheat_usd.final_gather.painted_light import LightByMasks
     from icheat_usd.final_gather.row_light import RowLight
 
@@ -38,6 +39,7 @@ class Hemispheres:
     light: list[LightByCaster] = field(default_factory=list)
     painted: list[LightByMasks] = field(default_factory=list)
     of_rows: list[RowLight] = field(default_factory=list)
+    of_pairs: list[EditedRecords] = field(default_factory=list)
     _shares: F32 | None = None
 
     @property

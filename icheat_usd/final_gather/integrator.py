@@ -282,7 +282,8 @@ def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | N
         return None
     b = sum_groups(per_light, field.light_group, field.n_groups)
     total = per_light.sum(axis=0, dtype=np.float32)
-    return GatherSolution(gather, b, total, offset_casters(field, field.casters(gather.points), b, gather.area))
+    offsets = offset_casters(field, field.casters(gather.points), b, gather.area) if field.has_offset else None
+    return GatherSolution(gather, b, total, offsets)
 
 
 def _band(

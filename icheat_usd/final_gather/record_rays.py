@@ -75,6 +75,15 @@ class RecordRays(NamedTuple):
             column[here] = other
         return points
 
+    def end_positions(self, flat: I64) -> F32:
+        """Where these surfaces are, (k, 3)."""
+        row, ray = flat // self.n_rays, flat % self.n_rays
+        directions, _ = self._directions(row, ray)
+        found = np.take(self.distance.reshape(-1), flat)[:, None] * directions + np.take(self.position, row, axis=0)
+        _, here, there = np.intersect1d(flat, self.detour, assume_unique=True, return_indices=True)
+        found[here] = self.detour_ends.position[there]
+        return found
+
     def _directions(self, row: I64, ray: I64) -> tuple[F32, I32]:
         directions, counter = np.empty((len(row), 3), np.float32), np.empty(len(row), np.int32)
         kernels.hemisphere_directions(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.edits.bound import BoundEdit
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import offset_casters
 from icheat_usd.final_gather.cached import CachedGather, under_stack
@@ -46,6 +47,11 @@ class Replay:
         self._gatherer, self._cached, self._bands, self._per_light = gatherer, cached, bands, per_light
         self._receivers = cached.receivers  # of each band, under the last stack
 
+    @property
+    def known(self) -> dict[str, BoundEdit]:
+        """Edits of the last stack by path: what `bind` need not find again."""
+        return {bound.edit.path: bound for bound in self._gatherer.field.edits}
+
     def edited(self, field: EditField) -> F64:
         """Indirect light under a stack, (height, width, 3).
 
@@ -54,7 +60,7 @@ class Replay:
         field : EditField
             Bound to the snapshot that was rendered.
         """
-        gatherer = self._under(field)
+        gatherer = self._gatherer = self._under(field)
         cache = self._cached.cache
         records = None if field.is_identity else edited_records(gatherer, cache, self._cached.hemispheres)
         parts = []

@@ -8,7 +8,7 @@ import numpy as np
 
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.record_rays import RecordRays
-from icheat_usd.kernels import row_light as kernels
+from icheat_usd.kernels import hemisphere_light as kernels
 from icheat_usd.materials import concatenate_points
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, I32, I64, U8, SceneSnapshot, SurfacePoints

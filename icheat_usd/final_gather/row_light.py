@@ -12,59 +12,48 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icheat_usd.edits.bound import Ends
 from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import Lookup
+from icheat_usd.final_gather.kept_changes import KeptChanges
 from icheat_usd.final_gather.receiver_sets import Touched, mixtures_of
 from icheat_usd.final_gather.row_hemispheres import Collected, collect
 from icheat_usd.final_gather.row_stack import RowStack
-from icheat_usd.kernels import record_mixtures, row_mixing
+from icheat_usd.kernels import record_mixtures, record_slots, row_mixing
 from icheat_usd.kernels import row_light as kernels
+from icheat_usd.kernels.row_edits import Stack
 from icheat_usd.kernels.row_sites import NEIGHBOURS
 from icheat_usd.materials import concatenate_points, take_points
-from icheat_usd.scene import F32, I32, I64, U8, Bool, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, Bool, SurfacePoints
 
 #: Decoded rows that are held at once; within the processor's caches, so that rays find their leaves fast.
 _DECODED_BYTES = 24 << 20
 
 
-#: Stacks whose light is kept for others, and calls whose sums are known to be there.
-_MOST_KEPT, _MOST_LISTED = 2, 64
+_MOST_KEPT = 2  #: stacks whose light is kept for others
 
 
-class _Listed(NamedTuple):
-    """Places whose sums are there, and what they asked for."""
+class _Asked(NamedTuple):
+    """What places ask for."""
 
-    found: Lookup
     where: I64
     which: I64
     begin: I64
     entry: I32
+    share: F32
     rows: I32
-    is_used: Bool
-
-    def is_like(self, other: _Listed) -> bool:
-        """Whether these places ask for the same sums."""
-        return (
-            self.found is other.found
-            and np.array_equal(self.where, other.where)
-            and np.array_equal(self.which, other.which)
-            and np.array_equal(self.begin, other.begin)
-            and np.array_equal(self.entry, other.entry)
-            and np.array_equal(self.rows, other.rows)
-            and np.array_equal(self.is_used, other.is_used)
-        )
+    weights: F32
 
 
-def row_light(gatherer: Gatherer, hemispheres: Hemispheres, position: F32, normal: F32) -> RowLight:
+def row_light(gatherer: Gatherer, stack: RowStack, hemispheres: Hemispheres, position: F32, normal: F32) -> RowLight:
     """Light of records for a stack, from what is known of it under another that differs in amounts alone.
 
     Parameters
     ----------
+    stack : RowStack of the gatherer's field
     position, normal : (n_records, 3) float32
     """
-    stack, sent = RowStack(gatherer.field), _sent(gatherer)
+    sent = _sent(gatherer)
     for one in hemispheres.of_rows:
         if one.take_amounts(gatherer, stack, sent):
             return one
@@ -86,8 +75,7 @@ class RowLight:
     ) -> None:
         self._gatherer, self._hemispheres, self._position, self._normal = gatherer, hemispheres, position, normal
         self._stack, self._rows, self._sent = stack, stack.rows, sent
-        self._casters: Ends | None = None
-        self._listed: list[_Listed] = []
+        self._changes = KeptChanges()
         self._sets: dict[bytes, int] = {}
         self._slot = np.zeros((0, self._hemispheres.n), np.int32)
         self._acts = np.zeros((0, self._stack.n_keys), np.uint8)
@@ -98,39 +86,46 @@ class RowLight:
             np.zeros((0, n, NEIGHBOURS), np.float32),
         )
         self._bases = np.zeros((0, row_mixing.LANES), np.float32)
-        self._lists = row_mixing.Lists(np.zeros((0, n), np.int32), *(np.full(1 << 12, -1, np.int32) for _ in range(2)))
-        self._base_of, self._payload_of = (np.zeros(1 << 12, np.int32) for _ in range(2))
+        self._lists = row_mixing.Lists(np.zeros((0, n), np.int32), *(np.full(1 << 12, -1, np.int32) for _ in range(4)))
+        self._packed: row_mixing.PackedLists | None = None
         self._n = 0
         self._sums = np.zeros((0, row_mixing.LANES), np.float32)
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
         """Change of irradiance at m receivers with records, (m, 3); `found` is of all points."""
-        where, which = receivers.where, receivers.which
         mixed = mixtures_of(receivers)
         number = np.array([self._set_of(is_in) for is_in in mixed.is_in], np.int32)
         entry = number[mixed.entry]
-        active = self._stack.acting_payloads(self._acts)
-        rows, weights = self._stack.mixtures(receivers.ends())
-        asked = _Listed(found, where, which, mixed.begin, entry, rows, weights != 0)
-        if not any(asked.is_like(one) for one in self._listed):
-            self._enter(asked, active, weights)
-        out = np.empty((len(where), 3), np.float32)
+        # What one edit changes is in proportion to its amount.
+        alone = self._stack.alone(self._acts)
+        in_proportion = bool((alone[number] >= 0).all())
+        rows, weights = self._stack.mixtures(receivers.ends(), with_amounts=not in_proportion)
+        asked = _Asked(receivers.where, receivers.which, mixed.begin, entry, mixed.weight, rows, weights)
+        change = self._changes.find(found, asked)
+        if change is None:
+            self._enter(found, asked)
+            change = self._mix(found, asked, points)
+            if self._hemispheres.is_kept:
+                self._changes.keep(found, asked, change)
+        if not in_proportion:
+            return change
+        edit = alone[entry[mixed.begin[receivers.which]]]
+        return change * self._stack.amounts[edit][:, None]
+
+    def _mix(self, found: Lookup, asked: _Asked, points: SurfacePoints) -> F32:
+        out = np.empty((len(asked.where), 3), np.float32)
         row_mixing.mix_rows(
             self._position,
             self._normal,
             points.position,
             points.shading_normal,
             *found[:3],
-            where,
-            which,
-            mixed.begin,
-            entry,
-            mixed.weight,
+            *asked[:5],
             self._slot,
-            active,
-            self._lists,
-            rows,
-            weights,
+            self._stack.acting_payloads(self._acts),
+            self._pack(),
+            asked.rows,
+            asked.weights,
             self._bases,
             self._sums,
             out,
@@ -140,8 +135,7 @@ class RowLight:
     def take_amounts(self, gatherer: Gatherer, stack: RowStack, sent: F32) -> bool:
         """Go on with another stack, if what is known holds under it too.
 
-        A sum is of one row at full amount: what the amount of its edit makes of it is in the weights of camera
-        samples. Where several edits act, the others' amounts are in the sum.
+        Where several edits act, the others' amounts are in the sum of a row.
         """
         is_same = (
             gatherer.is_part == self._gatherer.is_part
@@ -155,30 +149,25 @@ class RowLight:
 
     # What is asked for
 
-    def _enter(self, listed: _Listed, active: U8, weights: F32) -> None:
+    def _enter(self, found: Lookup, wanted: _Asked) -> None:
         """See to it that the sums that places ask for are known."""
-        found, where, which, begin, entry, rows, _ = listed
-        places = found.number, found.record, where, which, begin, entry
-        asked = np.zeros((len(self._slot), self._hemispheres.n), np.uint8)
-        record_mixtures.mark_records(*places, asked)
+        where, which, begin, entry, _, rows, weights = wanted
+        n_records, n_pairs = self._hemispheres.n, int(np.take(found.number, where).sum())
+        asked = np.zeros((len(self._slot), n_records), np.uint8)
+        record_mixtures.mark_records(found.number, found.record, where, which, begin, entry, asked)
+        pair_begin = np.empty(n_records + 1, np.int64)
+        pair, place = np.empty(n_pairs, np.int64), np.empty(n_pairs, np.int64)
+        record_slots.list_pairs(found.number, found.record, where, pair_begin, pair, place)
         n_bases, n_sums = len(self._record), self._n
         self._add_bases(asked.view(np.bool_) & (self._slot < 0))
-        own = np.arange(len(self._record) - n_bases)
+        active = self._stack.acting_payloads(self._acts)
+        new = np.arange(n_bases, len(self._record))
         self._list(
-            np.ones(len(own), np.int32),
-            self._record[n_bases:, None].astype(np.int32),
-            own,
-            own,
-            np.arange(len(own) + 1),
-            self._set[n_bases:].astype(np.int32),
-            active,
-            self._own_row[n_bases:],
-            self._own_weight[n_bases:],
+            len(new), row_mixing.list_own, new, active[self._set[new]], self._own_row[new], self._own_weight[new]
         )
-        self._list(*places, active, rows, weights)
+        places = pair_begin, place, which, begin, entry, self._slot
+        self._list(n_records, row_mixing.list_sums, *places, active, rows, weights)
         self._sum(n_bases, n_sums)
-        if self._hemispheres.is_kept:
-            self._listed = [*self._listed[1 - _MOST_LISTED :], listed]
 
     def _set_of(self, is_in: Bool) -> int:
         name = is_in.tobytes()
@@ -220,21 +209,26 @@ class RowLight:
             owners.append(part.owner[first])
         return take_points(concatenate_points(*parts), np.argsort(np.concatenate(owners), kind="stable"))
 
-    def _list(self, *asked: Any) -> None:
-        """Enter sums that are not there yet; arguments of `row_mixing.list_sums` from `count` on."""
-        places, at = asked[:6], asked[6:]
-        done, n = 0, self._n
+    def _list(self, n: int, enter: Any, *asked: Any) -> None:
+        """Enter sums that are not there yet, by `row_mixing.list_sums` or `list_own`, of `n` records or bases."""
+        done = 0
         while True:
-            given: Any = (done, *places, self._slot, *at, self._lists, self._base_of, self._payload_of, n)
-            done, n = row_mixing.list_sums(*given)
-            if done == len(at[-1]):
+            done, self._n = enter(done, *asked, self._lists, self._n)
+            if done == n:
                 break
-            more = np.full(max(len(self._base_of), 1 << 16), -1, np.int32)
-            following, row = (np.concatenate([column, more]) for column in self._lists[1:])
-            self._lists = row_mixing.Lists(self._lists.head, following, row)
-            self._base_of = np.concatenate([self._base_of, more])
-            self._payload_of = np.concatenate([self._payload_of, more])
-        self._n = n
+            more = np.full(max(len(self._lists.row), 1 << 16), -1, np.int32)
+            self._lists = row_mixing.Lists(
+                self._lists.head, *(np.concatenate([column, more]) for column in self._lists[1:])
+            )
+            self._packed = None
+
+    def _pack(self) -> row_mixing.PackedLists:
+        if self._packed is None or len(self._packed.row) != self._n:
+            n_lists = self._lists.head.size
+            columns = (np.empty(n, np.int32) for n in (n_lists + 1, self._n, self._n))
+            self._packed = row_mixing.PackedLists(*columns)
+            row_mixing.pack_lists(self._lists, *self._packed)
+        return self._packed
 
     # Sums
 
@@ -242,10 +236,7 @@ class RowLight:
         """Sums from `first_sum` on, and light at the records of bases from `first_base` on."""
         n = self._n - first_sum
         self._sums = np.concatenate([self._sums, np.zeros((n, row_mixing.LANES), np.float32)])
-        base_of, payload_of = (
-            column[first_sum : self._n].astype(np.int64) for column in (self._base_of, self._payload_of)
-        )
-        row = self._lists.row[first_sum : self._n].astype(np.int64)
+        row, base_of, payload_of = (column[first_sum : self._n].astype(np.int64) for column in self._lists[2:])
         has_own = (self._own_weight != 0).any(axis=(1, 2))
         is_new = has_own | self._stack.has_constants(self._acts)[self._set]
         is_new[:first_base] = False
@@ -309,16 +300,14 @@ class RowLight:
             begin += len(parts[-1])
         return np.concatenate(parts), at, own_at
 
-    def _collect(self, records: I64) -> tuple[Collected, kernels.Stack]:
+    def _collect(self, records: I64) -> tuple[Collected, Stack]:
         """Hemispheres of some records, and the edits at the ends of their rays."""
         field, solution = self._gatherer.field, self._gatherer.solution
         assert solution is not None
-        if self._casters is None:
-            self._casters = field.casters(solution.gather.points)
         snapshot = self._gatherer.snapshot
         varied = self._stack.varied(snapshot.n_instances)
         rays = collect(self._hemispheres, records, snapshot, solution.gather, varied)
-        casters = [self._casters]
+        casters = [self._stack.casters(solution.gather.points)]
         if rays.strangers is not None:
             casters.append(field.casters(rays.strangers))
         return rays, self._stack.table(casters)

@@ -9,6 +9,7 @@ from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup
 from icheat_usd.final_gather.receiver_sets import Touched
 from icheat_usd.final_gather.row_light import row_light
+from icheat_usd.final_gather.row_stack import RowStack
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
 
@@ -21,8 +22,8 @@ class RowRecords:
 
     def __init__(self, gatherer: Gatherer, cache: IrradianceCache, hemispheres: Hemispheres) -> None:
         assert gatherer.solution is not None
-        self._gatherer = gatherer
-        self._light = row_light(gatherer, hemispheres, cache.table.position, cache.table.normal)
+        self._gatherer, self._stack = gatherer, RowStack(gatherer.field)
+        self._light = row_light(gatherer, self._stack, hemispheres, cache.table.position, cache.table.normal)
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
         """Change of irradiance at m receivers with records, (m, 3); `found` is of all points."""
@@ -31,7 +32,7 @@ class RowRecords:
     def change_alone(self, points: SurfacePoints, rays: Hemispheres, row: I64, receivers: Touched) -> F32:
         """The same at m receivers without records, from hemispheres of their own; `row` (m,) is that of each."""
         m, stands = len(row), rays.parts[0].points
-        own = row_light(self._gatherer, rays, stands.position, stands.shading_normal)
+        own = row_light(self._gatherer, self._stack, rays, stands.position, stands.shading_normal)
         # Each is its own record.
         itself = Lookup(np.ones(m, np.int32), row[:, None].astype(np.int32), *np.ones((2, m, 1), np.float32))
         at = take_points(points, receivers.where)

@@ -13,9 +13,9 @@ from icheat_usd.edits.field import EditField
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.operations import Level, PairCoefficients
 from icheat_usd.final_gather.same_stack import same_casters
-from icheat_usd.kernels import row_light as kernels
+from icheat_usd.kernels import row_edits as kernels
 from icheat_usd.kernels.row_sites import NEIGHBOURS
-from icheat_usd.scene import F32, I32, U8, Bool
+from icheat_usd.scene import F32, I32, I64, U8, Bool, SurfacePoints
 
 _BLENDS = {Blend.COMPOSE: kernels.COMPOSE, Blend.OVER: kernels.OVER, Blend.ADD: kernels.ADD}
 
@@ -52,6 +52,7 @@ class RowStack:
     ----------
     rows : list of BoundRows
         Of all keys that are held so, in order: the payloads.
+    amounts : (n_edits,) float32
     """
 
     def __init__(self, field: EditField) -> None:
@@ -71,6 +72,8 @@ class RowStack:
         self._edit_of_key = np.array([key.edit for key in self._keys], np.int64)
         self._payload_of_key = np.array([key.payload for key in self._keys], np.int32)
         self._key_of_payload = np.flatnonzero(self._payload_of_key >= 0)
+        self.amounts = np.array([bound.edit.amount for bound in self._edits], np.float32)
+        self._casters: tuple[SurfacePoints, Ends] | None = None
 
     @property
     def n_keys(self) -> int:
@@ -103,8 +106,17 @@ class RowStack:
         """(.,) whether more than one edit acts."""
         return np.array([len(np.unique(self._edit_of_key[one > 0])) > 1 for one in acts], np.bool_)
 
-    def mixtures(self, receivers: Ends) -> tuple[I32, F32]:
-        """Rows at n receivers and their weights, amounts included: (n, n_payloads, 4)."""
+    def alone(self, acts: U8) -> I64:
+        """(.,) the edit that acts with rows and no other edit beside it, -1 for none."""
+        found = np.full(len(acts), -1, np.int64)
+        for one, acting in enumerate(acts > 0):
+            edits = np.unique(self._edit_of_key[acting])
+            if len(edits) == 1 and (self._payload_of_key[acting] >= 0).all():
+                found[one] = edits[0]
+        return found
+
+    def mixtures(self, receivers: Ends, *, with_amounts: bool = True) -> tuple[I32, F32]:
+        """Rows at n receivers and their weights, (n, n_payloads, 4)."""
         n = receivers.masks.shape[1]
         rows = np.empty((n, len(self.rows), NEIGHBOURS), np.int32)
         weights = np.empty(rows.shape, np.float32)
@@ -112,7 +124,7 @@ class RowStack:
         for bound in self._edits:
             held = [key for key in range(bound.n_keys) if bound.rows[key] is not None]
             located = receivers.located[first : first + len(held)]
-            shares = key_shares(bound, located)
+            shares = key_shares(bound if with_amounts else bound.at_full_amount, located)
             for key, mixture in zip(held, located, strict=True):
                 share = np.asarray(shares[key], np.float32)
                 rows[:, first] = mixture.rows
@@ -121,6 +133,12 @@ class RowStack:
         return rows, weights
 
     # Casters
+
+    def casters(self, points: SurfacePoints) -> Ends:
+        """`EditField.casters` of the points that most is asked of, which are kept."""
+        if self._casters is None or self._casters[0] is not points:
+            self._casters = points, self._field.casters(points)
+        return self._casters[1]
 
     def varied(self, n_instances: int) -> U8:
         """(n_instances,) 1 where an edit has casters on a part of an instance."""
@@ -154,6 +172,7 @@ class RowStack:
                 if name in ("delta", "emission"):
                     first = 0 if name == "delta" else 3
                     column[one, first : first + 3] = rows.rows.distinct_columns[3 * kind : 3 * kind + 3]
+        n_cells = np.array([rows.n_cells for rows in self.rows], np.int64)
         return kernels.Stack(
             np.searchsorted(self._edit_of_key, np.arange(len(self._edits) + 1)),
             np.array([_BLENDS[bound.edit.blend] for bound in self._edits]),
@@ -165,5 +184,6 @@ class RowStack:
             self._key_of_payload.astype(np.int32),
             leaf,
             column,
-            np.array([rows.n_cells for rows in self.rows], np.int64),
+            n_cells,
+            np.concatenate([[0], np.cumsum((1 + column.max(axis=1)) * n_cells)]),
         )

@@ -24,6 +24,16 @@ class Lists(NamedTuple):
     head: NDArray[np.int32]  #: (n_bases, n_payloads) first sum of each payload's rows, -1 for none
     next: NDArray[np.int32]  #: (room,) -1 at the end
     row: NDArray[np.int32]  #: (room,)
+    base: NDArray[np.int32]  #: (room,)
+    payload: NDArray[np.int32]  #: (room,)
+
+
+class PackedLists(NamedTuple):
+    """The same, one list after another, rows ascending: in whatever order they came, they are added in this one."""
+
+    begin: NDArray[np.int32]  #: (n_bases * n_payloads + 1,)
+    row: NDArray[np.int32]  #: (n_sums,)
+    sum: NDArray[np.int32]  #: (n_sums,)
 
 
 @kernel
@@ -35,14 +45,37 @@ def _find(lists, base, payload, row):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _list_rows(lists, base, active, rows, weights, n):  # type: ignore[no-untyped-def]
+    """Enter the rows (n_payloads, 4) of one place that are not there yet; returns `n`, -1 for want of room."""
+    for payload in range(rows.shape[0]):
+        if active[payload] == 0:
+            continue
+        for s in range(rows.shape[1]):
+            row = rows[payload, s]
+            if row < 0 or weights[payload, s] == np.float32(0.0) or _find(lists, base, payload, row) >= 0:
+                continue
+            if n == len(lists.row):
+                return -1
+            lists.row[n] = row
+            lists.next[n] = lists.head[base, payload]
+            lists.base[n] = base
+            lists.payload[n] = payload
+            lists.head[base, payload] = n
+            n += 1
+    return n
+
+
+@kernel
 def list_sums(  # type: ignore[no-untyped-def]
-    first, count, record, where, which, begin, entry, slot, active, rows, weights, lists, base_of, payload_of, n
+    first, pair_begin, place, which, begin, entry, slot, active, rows, weights, lists, n
 ):
-    """Enter the sums that places ask for, from place `first` on; returns where it ended for want of room, and `n`.
+    """Enter the sums that places ask of records `first` on; returns where it ended for want of room, and `n`.
 
     Parameters
     ----------
-    count, record, where, which, begin, entry : as of `record_mixtures.mark_records`
+    pair_begin : (n_records + 1,) int64, place : (n_pairs,) int64
+        As of `record_slots.list_pairs`: places of each record.
+    which, begin, entry : as of `record_mixtures.mark_records`
     slot : (n_sets, n_records) int32
         Base of each record.
     active : (n_sets, n_payloads) uint8
@@ -51,30 +84,63 @@ def list_sums(  # type: ignore[no-untyped-def]
     n : int
         Sums so far.
     """
-    n_payloads, n_mixed = rows.shape[1], rows.shape[2]
-    for q in range(first, len(where)):
-        p = where[q]
-        entries = range(begin[which[q]], begin[which[q] + 1])
-        if n + len(entries) * count[p] * n_payloads * n_mixed > len(lists.row):
-            return q, n
-        for e in entries:
-            for k in range(count[p]):
-                base = slot[entry[e], record[p, k]]
-                for payload in range(n_payloads):
-                    if active[entry[e], payload] == 0:
-                        continue
-                    for s in range(n_mixed):
-                        row = rows[q, payload, s]
-                        if row < 0 or weights[q, payload, s] == np.float32(0.0):
-                            continue
-                        if _find(lists, base, payload, row) < 0:
-                            lists.row[n] = row
-                            lists.next[n] = lists.head[base, payload]
-                            lists.head[base, payload] = n
-                            base_of[n] = base
-                            payload_of[n] = payload
-                            n += 1
-    return len(where), n
+    for r in range(first, len(pair_begin) - 1):
+        last = np.int64(-1)
+        for e in range(pair_begin[r], pair_begin[r + 1]):
+            q = place[e]
+            # Neighbours mostly ask for the same.
+            if last >= 0 and which[q] == which[last] and _is_same(rows, weights, q, last):
+                continue
+            last = q
+            for i in range(begin[which[q]], begin[which[q] + 1]):
+                one = entry[i]
+                found = _list_rows(lists, slot[one, r], active[one], rows[q], weights[q], n)
+                if found < 0:
+                    return r, len(lists.row)
+                n = found
+    return len(pair_begin) - 1, n
+
+
+@kernel
+def _is_same(rows, weights, a, b):  # type: ignore[no-untyped-def]
+    for payload in range(rows.shape[1]):
+        for s in range(rows.shape[2]):
+            if rows[a, payload, s] != rows[b, payload, s]:
+                return False
+            if (weights[a, payload, s] == np.float32(0.0)) != (weights[b, payload, s] == np.float32(0.0)):
+                return False
+    return True
+
+
+@kernel
+def list_own(first, bases, active, rows, weights, lists, n):  # type: ignore[no-untyped-def]
+    """`list_sums` of rows that belong to bases themselves: those from ``bases[first]`` on, (n_bases, n_payloads, 4)."""
+    for i in range(first, len(bases)):
+        found = _list_rows(lists, bases[i], active[i], rows[i], weights[i], n)
+        if found < 0:
+            return i, len(lists.row)
+        n = found
+    return len(bases), n
+
+
+@kernel
+def pack_lists(lists, begin, row, number):  # type: ignore[no-untyped-def]
+    """Fill `PackedLists`."""
+    n_payloads, n = lists.head.shape[1], 0
+    begin[0] = 0
+    for base in range(lists.head.shape[0]):
+        for payload in range(n_payloads):
+            first = n
+            p = lists.head[base, payload]
+            while p >= 0:
+                k = n
+                while k > first and row[k - 1] > lists.row[p]:
+                    row[k], number[k] = row[k - 1], number[k - 1]
+                    k -= 1
+                row[k], number[k] = lists.row[p], p
+                n += 1
+                p = lists.next[p]
+            begin[base * n_payloads + payload + 1] = n
 
 
 @kernel
@@ -120,6 +186,7 @@ def mix_rows(  # type: ignore[no-untyped-def]
     at, facing, position, normal, count, record, weight, where, which, begin, entry, share :
         as of `record_mixtures.mix_records`
     slot, active, rows, weights : as of `list_sums`
+    lists : PackedLists
     bases : (n_bases, LANES), sums : (n_sums, LANES) float32
     """
     m = len(where)
@@ -196,17 +263,27 @@ def _mix_block(  # type: ignore[no-untyped-def]
                 for payload in range(rows.shape[1]):
                     if active[one, payload] == 0:
                         continue
-                    for s in range(rows.shape[2]):
-                        w = weights[q, payload, s]
-                        if rows[q, payload, s] >= 0 and w != np.float32(0.0):
-                            found = np.int64(_find(lists, base, payload, rows[q, payload, s]))
-                            light = simd.multiply_add(simd.spread(w), simd.load(sums_at + 64 * found), light)
+                    at_list = base * rows.shape[1] + payload
+                    for i in range(lists.begin[at_list], lists.begin[at_list + 1]):
+                        w = _weight(rows, weights, q, payload, lists.row[i])
+                        if w != np.float32(0.0):
+                            sum_at = sums_at + 64 * np.int64(lists.sum[i])
+                            light = simd.multiply_add(simd.spread(w), simd.load(sum_at), light)
                 simd.store(mixed_at, light)
                 w = weight[p, k] * share[e]
                 total_r += w * _value(mixed, 0, turn_t, turn_b, move_t, move_b)
                 total_g += w * _value(mixed, 5, turn_t, turn_b, move_t, move_b)
                 total_b += w * _value(mixed, 10, turn_t, turn_b, move_t, move_b)
         out[q, 0], out[q, 1], out[q, 2] = total_r, total_g, total_b
+
+
+@kernel
+def _weight(rows, weights, q, payload, row):  # type: ignore[no-untyped-def]
+    w = np.float32(0.0)
+    for s in range(rows.shape[2]):
+        if rows[q, payload, s] == row:
+            w = weights[q, payload, s]
+    return w
 
 
 @kernel

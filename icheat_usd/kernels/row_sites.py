@@ -192,10 +192,24 @@ def _furthest(key, near, place):  # type: ignore[no-untyped-def]
 
 @parallel_kernel
 def mixtures(  # type: ignore[no-untyped-def]
-    key, axis, begin, normal, reach, row, group, place, place_normal, out_row, out_weight, out_confidence, out_nearest
+    key,
+    axis,
+    begin,
+    normal,
+    reach,
+    row,
+    turn,
+    group,
+    position,
+    place_normal,
+    out_row,
+    out_weight,
+    out_confidence,
+    out_nearest,
 ):
-    """Rows and weights for n places (n, 6); group -1, or one without points, gives none.
+    """Rows and weights for n places; group -1, or one without points, gives none.
 
+    Keys are of the position and of the normal times the `turn` (n_groups,) of the group.
     Weights are those of Franke and Little: they fall to 0 at the distance of
     the fifth neighbour, so that nothing jumps where neighbours change. They
     sum to the confidence: 1 within the neighbours' `reach`, 0 from twice that
@@ -210,6 +224,7 @@ def mixtures(  # type: ignore[no-untyped-def]
         distance = np.empty(NEIGHBOURS + 1, np.float64)
         share = np.empty(NEIGHBOURS, np.float64)
         mixed = np.empty(NEIGHBOURS, np.float64)
+        place = np.empty(6, np.float64)
         last, found = np.int64(-1), np.int64(0)
         for q in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
             out_confidence[q] = 0.0
@@ -221,11 +236,13 @@ def mixtures(  # type: ignore[no-untyped-def]
             g = group[q]
             if g < 0 or begin[g] == begin[g + 1]:
                 continue
+            for c in range(3):
+                place[c], place[3 + c] = position[q, c], turn[g] * place_normal[q, c]
             # Places come in the order of pixels: the neighbours of the last one are near this one, too.
             within = np.inf
             if g == last and found > NEIGHBOURS:
-                within = _furthest(key, near, place[q])
-            found = _neighbours(key, axis, begin[g], begin[g + 1], place[q], within, stack, bound, near, distance)
+                within = _furthest(key, near, place)
+            found = _neighbours(key, axis, begin[g], begin[g + 1], place, within, stack, bound, near, distance)
             last = g
             used = min(found, NEIGHBOURS)
             for s in range(found):

@@ -51,7 +51,7 @@ class FrameReplay:
                 f"{session.snapshot.camera.path}: a frame with motion blur cannot be replayed; close the camera's "
                 "shutter or author disableMotionBlur on the render settings"
             )
-        self._session, self._settings = session, settings
+        self._session, self._settings, self._snapshot = session, settings, session.snapshot
         scene = aovs.layer_scene(session.snapshot, session.stack)
         sources = [layer_names.canonical(name) for name in layers]
         asked = [layer_names.Layer(source, layer_names.layer_name(source)) for source in sources]
@@ -72,7 +72,8 @@ class FrameReplay:
         stack = session.stack
         replay = self._result.replay
         assert replay is not None
-        edited = replay.edited(bind(stack, session.snapshot))
+        known = replay.known if session.snapshot is self._snapshot else None
+        edited = replay.edited(bind(stack, session.snapshot, known))
         metadata = image_metadata(session.snapshot, "final gather", stack, asdict(self._settings))
         result = replace(self._result, indirect_edited=edited)
         return aovs.make_film(result, self._members, self._scene, session.snapshot, metadata)

@@ -140,6 +140,10 @@ def test_what_is_declared_to_be_used_is_all_that_is_used(name: str) -> None:
         changed = operation.evaluate(parameters, pairs)
         same = all(np.array_equal(a, b) for a, b in zip(base, changed, strict=True) if a is not None)
         assert same != getattr(operation, flag), flag
+    if not operation.uses_normals:
+        turned = (place._replace(normal=end().normal, albedo=end().albedo) for place in (receiver, caster))
+        changed = operation.evaluate(parameters, Pairs(light, *turned))
+        assert all(np.array_equal(a, b) for a, b in zip(base, changed, strict=True) if a is not None)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.edits.model import Edit, KeyedPayload, Payload, SurfaceMask
+from icheat_usd.edits.model import Blend, Edit, KeyedPayload, Payload, SurfaceMask
 from icheat_usd.final_gather import GatherSettings, final_gather, masked_records
-from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, WHITE, painted, previews, soft
+from icheat_usd.final_gather.edited_records import EditedRecords
+from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, SIDES, WHITE, painted, previews, soft
 from tests.final_gather.test_rows import FLOOR, baked
 from tests.pipeline import TINY, select
 
@@ -101,6 +102,13 @@ def rows_and_others() -> tuple[Edit, ...]:
     return (rows(), painted("scale", {"gain": 4.0}), BLEED)
 
 
+def recipes() -> tuple[Edit, ...]:
+    """Edits that look at where receivers and casters are, some over each other."""
+    far = Edit("/far", "falloff", {"exponent": 1.0}, select("/floor", "/back"), SIDES)
+    turned = Edit("/turned", "direction", {"sharpness": 2.0}, select("/floor"), EVERYTHING, amount=0.6)
+    return (far, turned, replace(far, path="/over", casters=EVERYTHING, blend=Blend.OVER, amount=0.5), BLEED)
+
+
 def changed_stacks(edits: tuple[Edit, ...]) -> list[tuple[Edit, ...]]:
     """Amounts twice, one edit muted, and all as they were."""
     first, *others = edits
@@ -111,8 +119,16 @@ def changed_stacks(edits: tuple[Edit, ...]) -> list[tuple[Edit, ...]]:
 
 @pytest.mark.parametrize(
     "edits",
-    [BRUSHED[:1], BRUSHED, (rows(),), (rows(), rows(path="/again", amount=0.5)), rows_and_others()],
-    ids=["brush", "brushes", "rows", "rows over rows", "rows and others"],
+    [
+        BRUSHED[:1],
+        BRUSHED,
+        (rows(),),
+        (rows(), rows(path="/again", amount=0.5)),
+        rows_and_others(),
+        recipes()[:1],
+        recipes(),
+    ],
+    ids=["brush", "brushes", "rows", "rows over rows", "rows and others", "recipe", "recipes"],
 )
 def test_changed_edits_replay_as_they_render(edits):
     kept = rendered(*edits, is_kept=True)
@@ -120,6 +136,24 @@ def test_changed_edits_replay_as_they_render(edits):
         again = rendered(*changed).indirect_edited
         np.testing.assert_array_equal(kept.replay.edited(previews()[0].field(*changed)), again)
         assert (again != kept.indirect).any()
+
+
+@pytest.mark.parametrize(
+    "edits",
+    [
+        recipes()[:1],
+        recipes(),
+        (replace(recipes()[0], blend=Blend.ADD), painted("falloff", {"exponent": 0.5}), *STACKS["added light"]),
+        (rows(), *recipes()[:2]),
+    ],
+    ids=["one", "several", "added, masks and emission", "beside rows"],
+)
+def test_light_under_recipes_is_the_light_of_the_rays(edits, monkeypatch):
+    fast = rendered(*edits)
+    monkeypatch.setattr(EditedRecords, "_by_tables", EditedRecords._by_pairs)
+    slow = rendered(*edits).indirect_edited
+    assert (slow != fast.indirect).mean() > 0.1 and (fast.indirect_edited != slow).any()
+    np.testing.assert_allclose(fast.indirect_edited, slow, rtol=2e-4, atol=1e-6)
 
 
 def test_a_changed_mask_replays_as_it_renders():
@@ -130,7 +164,7 @@ def test_a_changed_mask_replays_as_it_renders():
     np.testing.assert_array_equal(replayed, rendered(*changed).indirect_edited)
 
 
-@pytest.mark.parametrize("edits", [BRUSHED, (rows(),)], ids=["brushes", "rows"])
+@pytest.mark.parametrize("edits", [BRUSHED, (rows(),), recipes()[:1]], ids=["brushes", "rows", "recipe"])
 def test_rays_are_not_looked_at_again_for_a_changed_amount(edits, monkeypatch):
     kept = rendered(*edits, is_kept=True)
 
@@ -139,6 +173,7 @@ def test_rays_are_not_looked_at_again_for_a_changed_amount(edits, monkeypatch):
 
     monkeypatch.setattr("icheat_usd.kernels.painted_sums.painted_sums", refuse)
     monkeypatch.setattr("icheat_usd.kernels.row_light.row_sums", refuse)
+    monkeypatch.setattr("icheat_usd.final_gather.pair_tables.pair_sums", refuse)
     for changed in changed_stacks(edits)[:2]:
         assert (kept.replay.edited(previews()[0].field(*changed)) != kept.indirect_edited).any()
 

@@ -78,7 +78,7 @@ class Frame:
 def replay(frame: Frame, stack: EditStack) -> Callable[[EditStack], F64] | None:
     """What makes the indirect light of a frame again under other stacks; None if its method keeps nothing."""
     kept = frame.render(frame.field(stack), is_kept=True)[0].replay
-    return None if kept is None else lambda changed: kept.edited(frame.field(changed))
+    return None if kept is None else lambda changed: kept.edited(bind(changed, frame.snapshot, kept.known))
 
 
 def warm(snapshot: SceneSnapshot, effort: RenderEffort, stack: EditStack = EMPTY_STACK) -> None:

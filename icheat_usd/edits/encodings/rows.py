@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -142,8 +143,6 @@ class BoundRows:
         hit = points.instance >= 0
         side = 2 * np.where(hit, points.instance, 0).astype(np.int64) + points.side
         group = np.where(hit, search.group[side], -1) if len(search.group) else np.full(n, -1, np.int64)
-        turn = search.turn[np.maximum(group, 0)] if len(search.turn) else np.zeros(n)
-        place = np.concatenate([points.position, points.shading_normal * turn[:, None]], axis=1).astype(np.float64)
         rows = np.empty((n, row_sites.NEIGHBOURS), np.int32)
         weights = np.empty((n, row_sites.NEIGHBOURS), np.float32)
         confidence, nearest = np.empty(n, np.float32), np.empty((n, 2), np.float64)
@@ -154,9 +153,10 @@ class BoundRows:
             search.normal,
             search.reach,
             search.row,
+            search.turn,
             group,
-            place,
-            np.ascontiguousarray(points.shading_normal),
+            np.require(points.position, np.float32, ["C", "W"]),
+            np.require(points.shading_normal, np.float32, ["C", "W"]),
             rows,
             weights,
             confidence,
@@ -188,6 +188,10 @@ class BoundRows:
         return PairCoefficients(np.float32(1) + delta, column.get("emission"), column.get("offset"))
 
 
+#: What is the same on every scene: the frames of a sequence share it.
+_CONTRACTED: WeakKeyDictionary[SampledRows, tuple[_Coefficients, I32]] = WeakKeyDictionary()
+
+
 def bind_rows(rows: SampledRows, snapshot: SceneSnapshot, where: str) -> BoundRows:
     """Find the samples of `rows` on a scene, at its time.
 
@@ -197,7 +201,9 @@ def bind_rows(rows: SampledRows, snapshot: SceneSnapshot, where: str) -> BoundRo
     """
     leaves = find_places(rows.leaves, rows.surfaces, rows.bounds, snapshot, where)
     sites = find_places(rows.sites, rows.surfaces, rows.bounds, snapshot, where)
-    coefficients, cell = _contracted(rows)
+    if rows not in _CONTRACTED:
+        _CONTRACTED[rows] = _contracted(rows)
+    coefficients, cell = _CONTRACTED[rows]
     locator, on_side = _leaf_locator(rows, leaves.points, snapshot)
     return BoundRows(
         rows,

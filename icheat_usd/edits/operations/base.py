@@ -130,6 +130,8 @@ class Operation(ABC):
     uses_receiver: ClassVar[bool] = False
     #: True if they depend on `Pairs.caster`.
     uses_caster: ClassVar[bool] = False
+    #: False if it looks at no more of receivers and casters than where they are.
+    uses_normals: ClassVar[bool] = True
     #: True if `evaluate` gives offsets.
     has_offset: ClassVar[bool] = False
     #: True if the offset is light that the receiver's diffuse albedo reflects, False if it is paint on top.

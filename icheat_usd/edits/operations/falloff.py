@@ -16,6 +16,7 @@ from icheat_usd.edits.operations.base import (
     Parameter,
     number,
 )
+from icheat_usd.kernels.distances import distance_powers
 
 #: Share of the pivot distance below which pairs count as being this far apart: light with an exponent above 2
 #: would have no bound where receivers touch casters.
@@ -43,6 +44,7 @@ class Falloff(Operation):
     )
     uses_receiver = True
     uses_caster = True
+    uses_normals = False
 
     def prepare(self, parameters: Mapping[str, Value], scene: BoundScene) -> Mapping[str, Value]:
         if number(parameters, "pivot") > 0:
@@ -51,8 +53,8 @@ class Falloff(Operation):
         return {**parameters, "pivot": mean if mean > 0 else 1.0}  # Without a mean there are no pairs.
 
     def evaluate(self, parameters: Mapping[str, Value], pairs: Pairs) -> PairCoefficients:
-        between = pairs.receiver.position - pairs.caster.position
-        distance = np.sqrt(np.einsum("ij,ij->i", between, between))
-        relative = np.maximum(distance / np.float32(number(parameters, "pivot")), np.float32(NEAREST))
-        scale = relative ** np.float32(2.0 - number(parameters, "exponent"))
-        return PairCoefficients(np.repeat(scale[:, None], 3, axis=1))
+        receiver, caster = pairs.receiver.position, pairs.caster.position
+        scale = np.empty(max(len(receiver), len(caster)), np.float32)
+        pivot, power = np.float32(number(parameters, "pivot")), np.float32(2.0 - number(parameters, "exponent"))
+        distance_powers(receiver, caster, pivot, np.float32(NEAREST), power, scale)
+        return PairCoefficients(np.broadcast_to(scale[:, None], (len(scale), 3)))
