@@ -8,6 +8,7 @@ import numpy as np
 
 from icheat_usd.edits.selection import BoundSelection
 from icheat_usd.kernels import samples as kernels
+from icheat_usd.kernels.distances import mean_distance
 from icheat_usd.materials import points_on_surface
 from icheat_usd.samples import instance_areas
 from icheat_usd.scene import F64, I64, SceneSnapshot
@@ -43,8 +44,7 @@ class Measures:
         ends = [_choose(*_weighted_places(self.snapshot, side, _N_ROUGH_PLACES)) for side in sides]
         if not all(len(end) for end in ends):
             return 0.0
-        # Summed by receiver, so that no table of all pairs in three dimensions is needed.
-        return float(np.mean([np.linalg.norm(ends[1] - place, axis=1).mean() for place in ends[0]]))
+        return float(mean_distance(*ends))
 
     def caster_area(self) -> float:
         """Area of the casters, weighted by their masks, square metres.

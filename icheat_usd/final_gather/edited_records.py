@@ -171,9 +171,9 @@ class EditedRecords:
         share = hemispheres.shares()
         for part in batches(hemispheres, np.asarray(wanted.any(axis=0), np.bool_)):
             owner = part.owner
-            sums = PairSums(
-                self._gatherer, stack, part, cache.table.reach[owner], share[owner], hemispheres.shrink[owner]
-            )
+            reach, shrink = cache.table.reach[owner], hemispheres.shrink[owner]
+            asked = np.asarray(is_in.T @ wanted[:, owner], np.bool_)
+            sums = PairSums(self._gatherer, stack, part, reach, share[owner], shrink, asked)
             for one, (_, needed, values) in enumerate(missing):
                 rows = np.flatnonzero(needed[owner])
                 if len(rows) == 0:

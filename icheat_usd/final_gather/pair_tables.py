@@ -25,6 +25,7 @@ from icheat_usd.scene import F32, I64, U8, Bool
 
 _BLENDS = {Blend.COMPOSE: COMPOSE, Blend.OVER: OVER, Blend.ADD: ADD}
 _RAYS_AT_ONCE = 1 << 19
+_NOWHERE = np.zeros((1, 3), np.float32)
 
 
 class _Key(NamedTuple):
@@ -67,15 +68,15 @@ class PairStack:
         found = found[found >= 0]
         return int(found[0]) if len(found) == 1 else -1
 
-    def coefficients(self, receivers: Ends, casters: Ends, row: I64, located: F32, beside: list[Beside]) -> _Tables:
-        """Of n pairs of receivers `row` and casters; `located` (n_rows, n_receivers) as of `is_located`."""
+    def coefficients(self, receivers: Ends, casters: Ends, row: I64, wanted: F32, beside: list[Beside]) -> _Tables:
+        """Of n pairs of receivers `row` and casters; `wanted` (n_rows, n_receivers) is 0 for keys of no matter."""
         n, n_places = len(row), 1 + len(beside)
         weight = np.zeros((len(self._keys), n), np.float32)
         parts: list[tuple[int, int, I64, PairCoefficients]] = []
         for q, key in enumerate(self._keys):
             own = [k.located for k in self._keys if k.bound is key.bound and k.located >= 0]
             share = key_shares(key.bound.at_full_amount, [receivers.located[one] for one in own])[key.number]
-            at_receivers = np.asarray(share, np.float32) * located[key.row]
+            at_receivers = np.asarray(share, np.float32) * wanted[key.row]
             weight[q] = np.take(at_receivers, row) * casters.masks[key.row]
             touched = np.flatnonzero(weight[q])
             if len(touched) == 0:
@@ -112,6 +113,9 @@ def _evaluated(
 ) -> PairCoefficients:
     """Coefficients of some pairs, for receivers that are taken to be somewhere."""
     at = row[touched]
+    operation = key.bound.operation
+    if place is not None and operation is not None and not operation.uses_normals:
+        place = PairEnd(place.position, _NOWHERE, _NOWHERE)
     pairs = Pairs(np.broadcast_to(np.float32(0), (len(touched), 3)), _taken(place, at), _taken(casters.place, touched))
     if key.located < 0:
         return key.bound.evaluate(key.number, pairs, None, None)
@@ -121,7 +125,7 @@ def _evaluated(
 
 def _taken(place: PairEnd | None, which: I64) -> PairEnd:
     if place is None:
-        return PairEnd(*(np.zeros((1, 3), np.float32),) * 3)
+        return PairEnd(_NOWHERE, _NOWHERE, _NOWHERE)
     return PairEnd(*(column if len(column) == 1 else np.take(column, which, axis=0) for column in place))
 
 
@@ -130,9 +134,28 @@ def _is_grey(scale: F32) -> bool:
 
 
 class PairSums:
-    """Rays of some records, and what the stack makes of each; light of records is summed from these."""
+    """Rays of some records, and what the stack makes of each; light of records is summed from these.
 
-    def __init__(self, gatherer: Gatherer, stack: PairStack, part: Part, reach: F32, share: F32, shrink: F32) -> None:
+    Parameters
+    ----------
+    part : Part
+        Of n hemispheres.
+    reach, share, shrink : (n,) float32
+        Of their records; see `HemisphereTable`.
+    wanted : (n_rows, n)
+        Masks of the field that will be asked for, of each.
+    """
+
+    def __init__(
+        self,
+        gatherer: Gatherer,
+        stack: PairStack,
+        part: Part,
+        reach: F32,
+        share: F32,
+        shrink: F32,
+        wanted: Bool,
+    ) -> None:
         solution = gatherer.solution
         assert solution is not None
         rays, points, self.owner = part
@@ -148,7 +171,7 @@ class PairSums:
         if receivers.place is not None:
             self.beside = places_beside(receivers.place, reach, with_turns=looks_at_normals)
         row = flat // rays.n_rays
-        found = stack.coefficients(receivers, casters, row, is_located(receivers, field), self.beside)
+        found = stack.coefficients(receivers, casters, row, wanted * is_located(receivers, field), self.beside)
         n = len(rays.stream)
         self._table = PairTable(
             np.searchsorted(row, np.arange(n + 1)), (flat - row * rays.n_rays).astype(np.int32), *found
@@ -201,8 +224,7 @@ def _casters(gatherer: Gatherer, stack: PairStack, rays: RecordRays, flat: I64, 
     if looks_closer or not all(casters.constant_on_instances for casters in selections):
         return field.casters(rays.ends(gatherer.snapshot, flat))
     masks = np.stack([np.take(casters.on_instances, sender) for casters in selections]).astype(np.float32)
-    nowhere = np.zeros((1, 3), np.float32)
-    return Ends(masks, PairEnd(rays.end_positions(flat), nowhere, nowhere), ())
+    return Ends(masks, PairEnd(rays.end_positions(flat), _NOWHERE, _NOWHERE), ())
 
 
 def batches(hemispheres: Hemispheres, wanted: Bool) -> Iterator[Part]:

@@ -1,4 +1,4 @@
-"""Powers of distances between points."""
+"""Distances between points: their powers, their mean."""
 
 from __future__ import annotations
 
@@ -26,3 +26,16 @@ def _distance_powers(first, end, a, b, unit, least, power, out):  # type: ignore
         x, y, z = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
         distance = np.sqrt(x * x + y * y + z * z)
         out[q] = max(distance / unit, least) ** power
+
+
+@kernel
+def mean_distance(a, b):  # type: ignore[no-untyped-def]
+    """Mean over all pairs of two sets of points, (n, 3) and (m, 3) float64."""
+    total = 0.0
+    for i in range(len(a)):
+        of_one = 0.0
+        for j in range(len(b)):
+            x, y, z = b[j, 0] - a[i, 0], b[j, 1] - a[i, 1], b[j, 2] - a[i, 2]
+            of_one += np.sqrt(x * x + y * y + z * z)
+        total += of_one / len(b)
+    return total / len(a)

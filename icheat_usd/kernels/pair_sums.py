@@ -74,12 +74,16 @@ def _sums_of_hemisphere(  # type: ignore[no-untyped-def]
     light, scale = np.empty((n_groups + 1, 3), np.float32), np.empty((n_groups + 1, 3), np.float32)
     change = np.empty(6, np.float32)
     total, more = np.zeros((3, 5), np.float64), np.zeros((n_places, 3), np.float64)
+    is_grey = _is_grey(pairs, edits)
     a = hemispheres.adjusted_begin[h]
     for i in range(pairs.begin[h], pairs.begin[h + 1]):
         ray = pairs.ray[i]
         while a < hemispheres.adjusted_begin[h + 1] and hemispheres.adjusted[a] < h * n_rays + ray:
             a += 1
         a = arriving(h, ray, a, hemispheres, sent, emits, light)
+        if is_grey:
+            _add_grey(i, one, pairs, edits, amount, is_in, linear[ray], light, total, more)
+            continue
         for place in range(n_places):
             if not _lay_all(i, place, one, pairs, edits, amount, is_in, change, scale):
                 break  # nor at any other place
@@ -102,6 +106,60 @@ def _sums_of_hemisphere(  # type: ignore[no-untyped-def]
             out[t, c, 3 + 3 * k] = along_t * tz + along_b * bz
         for place in range(1, n_places):
             beside[t, place - 1, c] = more[place, c] - more[0, c]
+
+
+@kernel
+def _is_grey(pairs, edits):  # type: ignore[no-untyped-def]
+    """Whether edits do the same to all channels and groups of lights, and add no light."""
+    if pairs.change.shape[3] > 1 or pairs.emission.shape[1] > 0:
+        return False
+    for e in range(len(edits.blend)):
+        for g in range(edits.groups.shape[1]):
+            if edits.groups[e, g] == 0:
+                return False
+    return True
+
+
+@kernel
+def _add_grey(i, one, pairs, edits, amount, is_in, linear, light, total, more):  # type: ignore[no-untyped-def]
+    """Add what the edits of a set change of a pair's light, if all are grey."""
+    red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for g in range(len(light) - 1):
+        red, green, blue = red + light[g, 0], green + light[g, 1], blue + light[g, 2]
+    for place in range(len(more)):
+        scale, acts = np.float32(1.0), False
+        for e in range(len(edits.blend)):
+            kept, change = np.float32(0.0), np.float32(0.0)
+            for q in range(edits.first_key[e], edits.first_key[e + 1]):
+                if is_in[one, q] != 0 and pairs.weight[q, i] != np.float32(0.0):
+                    kept += pairs.weight[q, i]
+                    change += pairs.change[place, q, i, 0]
+            if kept != np.float32(0.0):
+                acts = True
+                scale = _laid(edits.blend[e], amount[one, e], kept, change, scale)
+        if not acts:
+            return  # nor at any other place
+        factor = scale - np.float32(1.0)
+        light_r, light_g, light_b = factor * red, factor * green, factor * blue
+        straight = np.float64(linear[0])
+        more[place, 0] += straight * light_r
+        more[place, 1] += straight * light_g
+        more[place, 2] += straight * light_b
+        if place == 0:
+            for k in range(5):
+                by = np.float64(linear[k])
+                total[0, k] += by * light_r
+                total[1, k] += by * light_g
+                total[2, k] += by * light_b
+
+
+@kernel
+def _laid(blend, amount, kept, change, scale):  # type: ignore[no-untyped-def]
+    if blend == OVER:
+        return (np.float32(1.0) - amount * kept) * scale + amount * (kept + change)
+    if blend == ADD:
+        return scale + amount * change
+    return (np.float32(1.0) + amount * change) * scale
 
 
 @kernel

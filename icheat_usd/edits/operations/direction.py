@@ -64,4 +64,4 @@ class Direction(Operation):
         cosine = (towards @ axis) / np.maximum(distance, np.finfo(np.float32).tiny)
         mean = mean_lobe(pairs.receiver.normal @ axis, sharpness)
         scale = np.float32(1) + strength * (lobe(cosine, sharpness) - mean)
-        return PairCoefficients(np.repeat(scale[:, None], 3, axis=1))
+        return PairCoefficients(np.broadcast_to(scale[:, None], (len(scale), 3)))

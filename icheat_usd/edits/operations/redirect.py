@@ -60,7 +60,7 @@ class Redirect(Operation):
         safe = np.where(full > 0, mean, np.float32(1))
         ratio = lobe(np.einsum("ij,ij->i", axis, away), exponent) / safe
         scale = np.float32(1) + full * (ratio - np.float32(1))
-        return PairCoefficients(np.repeat(scale[:, None], 3, axis=1).astype(np.float32))
+        return PairCoefficients(np.broadcast_to(scale.astype(np.float32)[:, None], (len(scale), 3)))
 
 
 def _unit(vectors: F32) -> F32:
