@@ -159,7 +159,7 @@ def under_stack(
         light[by_pairs] += base[which] - brought[which]
     rest = np.flatnonzero(~by_pairs)
     if len(rest):
-        some = receivers.take(rest)
+        some = receivers if len(rest) == len(where) else receivers.take(rest)
         at = some.where
         change = np.empty((len(rest), 3), np.float32)
         near, lost = np.flatnonzero(has_records[rest]), np.flatnonzero(~has_records[rest])

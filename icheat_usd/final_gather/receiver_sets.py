@@ -49,7 +49,7 @@ def touched(field: EditField, points: SurfacePoints) -> Touched:
     if field.uses_receiver:
         everyone = field.receivers(points)
         where = np.flatnonzero((everyone.masks > 0).any(axis=0))
-        some = everyone.take(where)
+        some = everyone if len(where) == everyone.masks.shape[1] else everyone.take(where)
         return Touched(field, where, some.masks, np.arange(len(where)), some)
     selections = [receivers for bound in field.edits for receivers in bound.receivers]
     if not all(receivers.constant_on_instances for receivers in selections):

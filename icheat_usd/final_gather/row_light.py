@@ -163,9 +163,15 @@ class RowLight:
         active = self._stack.acting_payloads(self._acts)
         new = np.arange(n_bases, len(self._record))
         self._list(
-            len(new), row_mixing.list_own, new, active[self._set[new]], self._own_row[new], self._own_weight[new]
+            len(new),
+            row_mixing.list_own,
+            new,
+            self._stack.first_row,
+            active[self._set[new]],
+            self._own_row[new],
+            self._own_weight[new],
         )
-        places = pair_begin, place, which, begin, entry, self._slot
+        places = pair_begin, place, which, begin, entry, self._slot, self._stack.first_row
         self._list(n_records, row_mixing.list_sums, *places, active, rows, weights)
         self._sum(n_bases, n_sums)
 

@@ -52,6 +52,8 @@ class RowStack:
     ----------
     rows : list of BoundRows
         Of all keys that are held so, in order: the payloads.
+    first_row : (n_payloads + 1,) int64
+        Rows of the payloads before each.
     amounts : (n_edits,) float32
     """
 
@@ -72,6 +74,7 @@ class RowStack:
         self._edit_of_key = np.array([key.edit for key in self._keys], np.int64)
         self._payload_of_key = np.array([key.payload for key in self._keys], np.int32)
         self._key_of_payload = np.flatnonzero(self._payload_of_key >= 0)
+        self.first_row = np.cumsum([0, *(len(rows.rows.row_pattern) for rows in self.rows)], dtype=np.int64)
         self.amounts = np.array([bound.edit.amount for bound in self._edits], np.float32)
         self._casters: tuple[SurfacePoints, Ends] | None = None
 
@@ -172,6 +175,7 @@ class RowStack:
                 if name in ("delta", "emission"):
                     first = 0 if name == "delta" else 3
                     column[one, first : first + 3] = rows.rows.distinct_columns[3 * kind : 3 * kind + 3]
+        is_grey = (column[:, :3] == column[:, :1]).all(axis=1) & (column[:, 3:] < 0).all(axis=1)
         n_cells = np.array([rows.n_cells for rows in self.rows], np.int64)
         return kernels.Stack(
             np.searchsorted(self._edit_of_key, np.arange(len(self._edits) + 1)),
@@ -186,4 +190,6 @@ class RowStack:
             column,
             n_cells,
             np.concatenate([[0], np.cumsum((1 + column.max(axis=1)) * n_cells)]),
+            bool(is_grey.all() and (constant[:, :3] == constant[:, :1]).all() and not constant[:, 3:].any())
+            and all(bound.groups.all() for bound in self._edits),
         )

@@ -29,6 +29,7 @@ class Stack(NamedTuple):
     column: NDArray[np.int32]  #: (n_payloads, 6) decoded column of S - 1 and of E, -1 for 0
     n_cells: NDArray[np.int64]  #: (n_payloads,)
     own: NDArray[np.int64]  #: (n_payloads + 1,) where the mixture of each begins in `own_rows`
+    is_grey: bool  #: all edits do the same to all channels and groups of lights, and add no light
 
 
 @kernel
@@ -101,6 +102,68 @@ def derivatives(  # type: ignore[no-untyped-def]
             e = len(acts) - 1 - step
             if met[e]:
                 _back(e, ray, stack, state, light, by_scale, by_emission)
+
+
+@kernel
+def grey_derivatives(  # type: ignore[no-untyped-def]
+    b, h, hemispheres, stack, sent, acts, is_in, own, linear, light, state, by_scale, lit, total
+):
+    """`derivatives` where all edits are grey: `by_scale` (n_edits, n_rays) is of `lit`, a ray's light in lanes."""
+    n_groups, n_edits = len(sent), len(acts)
+    a = hemispheres.adjusted_begin[h]
+    for ray in range(hemispheres.cell.shape[1]):
+        a = arriving(h, ray, a, hemispheres, sent, False, light)
+        if hemispheres.cell[h, ray] < 0:
+            continue
+        for c in range(3):
+            whole = np.float32(0.0)
+            for g in range(n_groups):
+                whole += light[g, c]
+            for k in range(5):
+                lit[ray, 5 * c + k] = whole * linear[ray, k]
+        caster, scale, n_met = hemispheres.caster[h, ray], np.float32(1.0), 0
+        for e in range(n_edits):
+            state[e, 0] = np.float32(-1.0)
+            if acts[e] == 0 or not _is_masked(b, e, caster, stack, is_in):
+                continue
+            kept, change = _grey_change(b, e, caster, stack, is_in, own)
+            carried, more = np.float32(1.0) + change, np.float32(0.0)
+            if stack.blend[e] == OVER:
+                carried, more = np.float32(1.0) - kept, kept + change
+            elif stack.blend[e] == ADD:
+                carried, more = np.float32(1.0), change
+            state[e, 0], state[e, 1], state[e, 2] = np.float32(1.0), scale, carried
+            scale = carried * scale + more
+            n_met += 1
+        if n_met == 0:
+            continue
+        factor = scale - np.float32(1.0)
+        for k in range(15):
+            total[k // 5, k % 5] += np.float64(factor * lit[ray, k])
+        slope = np.float32(1.0)
+        for step in range(n_edits):
+            e = n_edits - 1 - step
+            if state[e, 0] > np.float32(0.0):
+                by_scale[e, ray] = slope * state[e, 1] if stack.blend[e] == COMPOSE else slope
+                slope *= state[e, 2]
+
+
+@kernel
+def _grey_change(b, e, caster, stack, is_in, own):  # type: ignore[no-untyped-def]
+    """The sum of the weights of an edit's keys for a pair, and S - 1."""
+    kept, change = np.float32(0.0), np.float32(0.0)
+    for q in range(stack.first_key[e], stack.first_key[e + 1]):
+        mask = stack.mask[q, caster]
+        if is_in[b, q] == 0 or mask == np.float32(0.0):
+            continue
+        kept += stack.share[q] * mask
+        one = stack.payload[q]
+        if one < 0:
+            change += stack.share[q] * mask * stack.constant[q, 0]
+        elif stack.leaf[one, caster] >= 0 and stack.column[one, 0] >= 0:
+            at = stack.own[one] + stack.leaf[one, caster] + stack.column[one, 0] * stack.n_cells[one]
+            change += mask * own[at]
+    return kept, change
 
 
 @kernel

@@ -13,7 +13,7 @@ from numba import prange
 from icheat_usd.kernels import simd
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.hemisphere_light import linear_in_light
-from icheat_usd.kernels.row_edits import derivatives, own_rows
+from icheat_usd.kernels.row_edits import derivatives, grey_derivatives, own_rows
 from icheat_usd.kernels.row_mixing import LANES
 
 
@@ -121,8 +121,13 @@ def _sums_of_base(  # type: ignore[no-untyped-def]
     is_alone = n_acting == 1 and not is_new[b]
     own = np.empty(0, np.float32) if is_alone else own_rows(b, stack, own_at, own_weight, decoded)
     # Where one edit acts alone, its light is what arrives.
-    by_scale = np.zeros((0 if is_alone else n_edits, n_rays, 3), np.float32)
-    by_emission = np.zeros((0 if is_alone else n_edits, n_rays, 3), np.float32)
+    is_grey = stack.is_grey and not is_alone
+    n_derived = 0 if is_alone or is_grey else n_edits
+    by_scale = np.zeros((n_derived, n_rays, 3), np.float32)
+    by_emission = np.zeros((n_derived, n_rays, 3), np.float32)
+    by_grey = np.zeros((n_edits if is_grey else 0, n_rays), np.float32)
+    lit = np.zeros((n_rays if is_grey else 0, LANES), np.float32)
+    grey_state = np.empty((n_edits, 3), np.float32)
     lanes = np.zeros((n_rays, LANES), np.float32)
     leaf = np.empty(n_rays, np.int64)
     light, scale = np.empty((n_groups + 1, 3), np.float32), np.empty((n_groups + 1, 3), np.float32)
@@ -134,7 +139,11 @@ def _sums_of_base(  # type: ignore[no-untyped-def]
     for place in range(range_of[b, 0], range_of[b, 1]):
         h = order[place]
         linear_in_light(h, hemispheres, seed, n_theta, n_phi, linear)
-        if not is_alone:
+        if is_grey:
+            grey_derivatives(
+                b, h, hemispheres, stack, sent, acts, is_in, own, linear, light, grey_state, by_grey, lit, total
+            )
+        elif not is_alone:
             derivatives(
                 b,
                 h,
@@ -164,7 +173,9 @@ def _sums_of_base(  # type: ignore[no-untyped-def]
                 if stack.column[one, 3 * kind] < 0 and stack.column[one, 3 * kind + 1] < 0:
                     if stack.column[one, 3 * kind + 2] < 0:
                         continue
-                if is_alone:
+                if is_grey:
+                    n = _grey_lanes(h, hemispheres, stack, one, key, by_grey[edit], lit, lanes, leaf)
+                elif is_alone:
                     groups = stack.groups[edit]
                     n = _lanes_of_one(h, hemispheres, stack, one, key, groups, kind, sent, emits, linear, lanes, leaf)
                 else:
@@ -228,6 +239,24 @@ def _lit_lanes(h, hemispheres, stack, one, key, by, linear, lanes, leaf):  # typ
             light = mask * by[ray, c]
             for i in range(5):
                 lanes[n, 5 * c + i] = light * linear[ray, i]
+        n += 1
+    return n
+
+
+@kernel
+def _grey_lanes(h, hemispheres, stack, one, key, by, lit, lanes, leaf):  # type: ignore[no-untyped-def]
+    """`_lit_lanes` of `row_edits.grey_derivatives`."""
+    n, lit_at, lanes_at = 0, simd.address_of(lit), simd.address_of(lanes)
+    for ray in range(hemispheres.cell.shape[1]):
+        if hemispheres.cell[h, ray] < 0:
+            continue
+        caster = hemispheres.caster[h, ray]
+        mask = stack.mask[key, caster]
+        if mask == np.float32(0.0) or stack.leaf[one, caster] < 0:
+            continue
+        leaf[n] = stack.leaf[one, caster]
+        light = simd.multiply_add(simd.spread(mask * by[ray]), simd.load(lit_at + 64 * ray), simd.zeros())
+        simd.store(lanes_at + 64 * n, light)
         n += 1
     return n
 

@@ -45,14 +45,20 @@ def _find(lists, base, payload, row):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _list_rows(lists, base, active, rows, weights, n):  # type: ignore[no-untyped-def]
-    """Enter the rows (n_payloads, 4) of one place that are not there yet; returns `n`, -1 for want of room."""
+def _list_rows(lists, base, active, rows, weights, n, first_row, last_base):  # type: ignore[no-untyped-def]
+    """Enter the rows (n_payloads, 4) of one place that are not there yet; returns `n`, -1 for want of room.
+
+    `last_base` is, for each row of each payload, the base that it was last seen to be listed for.
+    """
     for payload in range(rows.shape[0]):
         if active[payload] == 0:
             continue
         for s in range(rows.shape[1]):
             row = rows[payload, s]
-            if row < 0 or weights[payload, s] == np.float32(0.0) or _find(lists, base, payload, row) >= 0:
+            if row < 0 or weights[payload, s] == np.float32(0.0) or last_base[first_row[payload] + row] == base:
+                continue
+            if _find(lists, base, payload, row) >= 0:
+                last_base[first_row[payload] + row] = base
                 continue
             if n == len(lists.row):
                 return -1
@@ -67,7 +73,7 @@ def _list_rows(lists, base, active, rows, weights, n):  # type: ignore[no-untype
 
 @kernel
 def list_sums(  # type: ignore[no-untyped-def]
-    first, pair_begin, place, which, begin, entry, slot, active, rows, weights, lists, n
+    first, pair_begin, place, which, begin, entry, slot, first_row, active, rows, weights, lists, n
 ):
     """Enter the sums that places ask of records `first` on; returns where it ended for want of room, and `n`.
 
@@ -78,12 +84,15 @@ def list_sums(  # type: ignore[no-untyped-def]
     which, begin, entry : as of `record_mixtures.mark_records`
     slot : (n_sets, n_records) int32
         Base of each record.
+    first_row : (n_payloads + 1,) int64
+        Rows of the payloads before each.
     active : (n_sets, n_payloads) uint8
     rows, weights : (m, n_payloads, 4)
         Of the places.
     n : int
         Sums so far.
     """
+    last_base = np.full(first_row[-1], -1, np.int32)
     for r in range(first, len(pair_begin) - 1):
         last = np.int64(-1)
         for e in range(pair_begin[r], pair_begin[r + 1]):
@@ -94,7 +103,7 @@ def list_sums(  # type: ignore[no-untyped-def]
             last = q
             for i in range(begin[which[q]], begin[which[q] + 1]):
                 one = entry[i]
-                found = _list_rows(lists, slot[one, r], active[one], rows[q], weights[q], n)
+                found = _list_rows(lists, slot[one, r], active[one], rows[q], weights[q], n, first_row, last_base)
                 if found < 0:
                     return r, len(lists.row)
                 n = found
@@ -113,10 +122,11 @@ def _is_same(rows, weights, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def list_own(first, bases, active, rows, weights, lists, n):  # type: ignore[no-untyped-def]
+def list_own(first, bases, first_row, active, rows, weights, lists, n):  # type: ignore[no-untyped-def]
     """`list_sums` of rows that belong to bases themselves: those from ``bases[first]`` on, (n_bases, n_payloads, 4)."""
+    last_base = np.full(first_row[-1], -1, np.int32)
     for i in range(first, len(bases)):
-        found = _list_rows(lists, bases[i], active[i], rows[i], weights[i], n)
+        found = _list_rows(lists, bases[i], active[i], rows[i], weights[i], n, first_row, last_base)
         if found < 0:
             return i, len(lists.row)
         n = found

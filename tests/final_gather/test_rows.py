@@ -63,6 +63,7 @@ def stack(name: str) -> tuple[Edit, ...]:
         "colours and emission": (glow(),),
         "two keys": (between(),),
         "two edits": (far(), near(amount=0.8)),
+        "grey blends": (far(), near(blend=Blend.OVER, amount=0.5), far(path="/more", blend=Blend.ADD)),
         "all blends": (glow(), far(), near(blend=Blend.OVER, amount=0.5), far(path="/more", blend=Blend.ADD)),
         "rows and masks": (BLEED, far(), painted("scale", {"gain": 4.0}), glow()),
     }
@@ -70,7 +71,7 @@ def stack(name: str) -> tuple[Edit, ...]:
 
 
 ALONE = ("one", "colours and emission", "two keys")
-SEVERAL = ("two edits", "all blends", "rows and masks")
+SEVERAL = ("two edits", "grey blends", "all blends", "rows and masks")
 
 
 class Built:
