@@ -18,13 +18,14 @@ import numpy as np
 from icheat_usd.edits.binding import bind
 from icheat_usd.edits.encodings.bake import at_full_amount, bake_field
 from icheat_usd.edits.model import EMPTY_STACK, Edit, EditStack, KeyedPayload, Payload
+from icheat_usd.edits.painting import paint_mask, soft_sphere
 from icheat_usd.final_gather.hits import trace_hemisphere
 from icheat_usd.materials import take_points
 from icheat_usd.samples import view_samples
 from icheat_usd.scene import F64, I32
 from icheat_usd.stage import open_stage, take_snapshot
 from tools.benchmarking.goals import Goal, at_least, at_most
-from tools.benchmarking.made_up_edits import one_edit, painted
+from tools.benchmarking.made_up_edits import one_edit
 from tools.benchmarking.parts import Effort
 from tools.benchmarking.render_efforts import lesser, said_of_lesser
 from tools.benchmarking.render_frame import Frame, replay, warm
@@ -159,11 +160,16 @@ def _edit(
     edit = one_edit(name, "scale", {"gain": 1.2, "color": color}, receivers, casters)
     if encoding == "object":
         return edit
-    # Brushes that cover all of the surfaces, and are nowhere constant.
-    for side, points in (("receiver_mask", frame.view.points), ("caster_mask", frame.gather.points)):
-        centre = points.position[int(rng.integers(len(points.position)))]
-        edit = painted(frame, edit, side, centre, 4 * frame.snapshot.radius)
-    return edit
+    # Brushes that cover all of the surfaces, and are nowhere constant: the scene is two of its radii wide.
+    masks = {}
+    for side, paths, points in (
+        ("receiver_mask", receivers, frame.view.points),
+        ("caster_mask", casters, frame.gather.points),
+    ):
+        x, y, z = points.position[int(rng.integers(len(points.position)))].tolist()
+        masks[side] = paint_mask(frame.snapshot, paths, soft_sphere((x, y, z), 0.0, 3 * frame.snapshot.radius))
+    payload = Payload(edit.operation, edit.parameters, **masks)
+    return replace(edit, keys=(KeyedPayload(payload, 1.0),))
 
 
 def _baked(frame: Frame, edit: Edit) -> Edit:
