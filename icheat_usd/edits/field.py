@@ -11,6 +11,7 @@ import numpy as np
 
 from icheat_usd.edits.bound import Aggregate, BoundEdit, Ends, StackCoefficients
 from icheat_usd.edits.composing import ONE, State, lay, pair_weights
+from icheat_usd.edits.mask_sheets import EntrySheets, sheets_of_many
 from icheat_usd.edits.mask_table import mask_table, weights_of
 from icheat_usd.edits.model import Blend
 from icheat_usd.edits.operations import Level, PairCoefficients, PairEnd
@@ -133,12 +134,13 @@ class EditField:
         """Soft receiver masks u alone, (n_rows, n)."""
         if self.uses_receiver or self._receiver_table is None:
             return self.receivers(points).masks
-        return weights_of(self._receiver_table, self.n_rows, points).T
+        return weights_of(*self._receiver_table, self.n_rows, points).T
 
     @cached_property
-    def _receiver_table(self) -> MaskTable | None:
+    def _receiver_table(self) -> tuple[MaskTable, EntrySheets] | None:
         selections = [receivers for bound in self.edits for receivers in bound.receivers]
-        return mask_table(selections, len(selections[0].on_instances)) if selections else None
+        table = mask_table(selections, len(selections[0].on_instances)) if selections else None
+        return None if table is None else (table, sheets_of_many(table))
 
     # Pairs
 

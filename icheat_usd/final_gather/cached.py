@@ -164,7 +164,8 @@ def under_stack(
         change = np.empty((len(rest), 3), np.float32)
         near, lost = np.flatnonzero(has_records[rest]), np.flatnonzero(~has_records[rest])
         if len(near):
-            change[near] = records.change(sampled.found, points, some.take(near))
+            reached = some if len(near) == len(rest) else some.take(near)
+            change[near] = records.change(sampled.found, points, reached)
         if len(lost):
             assert sampled.own_rays is not None
             rows = np.searchsorted(sampled.alone, at[lost])

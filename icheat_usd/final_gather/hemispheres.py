@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from icheat_usd.final_gather.record_rays import RecordRays
+from icheat_usd.kernels.caster_sums import RayTable
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
 
 if TYPE_CHECKING:
-    from icheat_usd.final_gather.caster_light import LightByCaster
     from icheat_usd.final_gather.edited_records import EditedRecords
+    from icheat_usd.final_gather.merged_light import MergedLight
     from icheat_usd.final_gather.painted_light import LightByMasks
     from icheat_usd.final_gather.row_light import RowLight
+    from icheat_usd.final_gather.slot_choices import SlotChoices
 
 _RAYS_AT_ONCE = 1 << 19
 
@@ -29,6 +31,14 @@ class Part(NamedTuple):
     owner: I64  #: record of each
 
 
+class TabledPart(NamedTuple):
+    """Some hemispheres, and their rays for compiled loops."""
+
+    rays: RecordRays
+    owner: I64
+    table: RayTable
+
+
 @dataclass(eq=False)
 class Hemispheres:
     """Rays of n records; some have several hemispheres."""
@@ -36,11 +46,13 @@ class Hemispheres:
     parts: list[Part]
     shrink: F32  #: (n,) factor on what changes with place
     is_kept: bool = False  #: whether other stacks will ask for the same
-    light: list[LightByCaster] = field(default_factory=list)
     painted: list[LightByMasks] = field(default_factory=list)
+    merged: list[MergedLight] = field(default_factory=list)
     of_rows: list[RowLight] = field(default_factory=list)
     of_pairs: list[EditedRecords] = field(default_factory=list)
+    choices: list[SlotChoices] = field(default_factory=list)
     _shares: F32 | None = None
+    _tables: list[TabledPart] | None = None
 
     @property
     def n(self) -> int:
@@ -66,6 +78,12 @@ class Hemispheres:
                 some = slice(first, min(first + at_once, n))
                 yield Part(_rows(part.rays, some), take_points(part.points, some), part.owner[some])
 
+    def tables(self) -> list[TabledPart]:
+        """`chunks`, as compiled loops take them."""
+        if self._tables is None:
+            self._tables = [TabledPart(part.rays, part.owner, ray_table(part.rays)) for part in self.chunks()]
+        return self._tables
+
 
 def _rows(rays: RecordRays, some: slice) -> RecordRays:
     limits = rays.n_rays * np.array([some.start, some.stop])
@@ -81,4 +99,28 @@ def _rows(rays: RecordRays, some: slice) -> RecordRays:
         detour=rays.detour[begin:end] - limits[0],
         detour_ends=take_points(rays.detour_ends, slice(begin, end)),
         **columns,
+    )
+
+
+def ray_table(rays: RecordRays) -> RayTable:
+    """Rays as compiled loops take them."""
+    n, n_rays = rays.cell.shape
+    ends = rays.detour_ends
+    lit = rays.cell.reshape(-1)[rays.detour] >= 0
+    return RayTable(
+        rays.cell,
+        rays.distance,
+        rays.instance,
+        rays.triangle,
+        rays.uv,
+        rays.shading_normal,
+        rays.stream,
+        np.searchsorted(rays.detour, n_rays * np.arange(n + 1)),
+        rays.detour,
+        np.searchsorted(rays.adjusted, n_rays * np.arange(n + 1)),
+        rays.adjusted,
+        np.ascontiguousarray(rays.throughput, np.float32),
+        np.where(lit, ends.instance, np.int32(-1)).astype(np.int32),
+        ends.face,
+        ends.face_uv,
     )

@@ -1,6 +1,6 @@
 """Light of cache records by the surface that it comes from, and by the painted masks on it.
 
-As `caster_light`, for stacks whose casters are painted with a few masks: replays look at no ray again.
+As `merged_light`, for stacks whose casters are painted with a few masks: replays look at no ray again.
 """
 
 from __future__ import annotations
@@ -8,10 +8,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from icheat_usd.final_gather.caster_light import list_of_casters, ray_table
 from icheat_usd.final_gather.hemispheres import Hemispheres
+from icheat_usd.final_gather.record_rays import RecordRays
 from icheat_usd.kernels import painted_sums as kernels
+from icheat_usd.kernels.caster_sums import RayTable, list_casters
 from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.scene import F32, I32, I64, Bool, Geometry
 
@@ -28,15 +30,20 @@ class _Entries(NamedTuple):
     values: F32  #: (n_sums, n_blocks, N_VALUES, 4)
 
 
-def is_of_few(casters: MaskTable) -> bool:
-    """Whether no caster has more painted masks than subsets are kept of."""
-    return bool((_numbers(_painted(casters)) <= kernels.MOST_PAINTED).all())
+def is_painted(casters: MaskTable) -> Bool:
+    """(n_instances,) whether a caster has painted masks."""
+    return np.asarray(_numbers(_painted(casters)) > 0)
 
 
-def light_by_masks(of: Hemispheres, sent: F32, casters: MaskTable) -> LightByMasks:
-    """What is known of hemispheres when cells send `sent`, for stacks with these painted masks."""
-    painted, selected = _painted(casters), np.diff(casters.begin) > 0
-    least = int(len(painted.mask) == len(casters.mask))
+def with_few(casters: MaskTable) -> Bool:
+    """(n_instances,) whether a caster has painted masks, and no more than subsets are kept of."""
+    return is_painted(casters) & (_numbers(_painted(casters)) <= kernels.MOST_PAINTED)
+
+
+def light_by_masks(of: Hemispheres, sent: F32, casters: MaskTable, selected: Bool) -> LightByMasks:
+    """What is known of hemispheres when cells send `sent`, from `selected` (n_instances,) casters with few masks."""
+    painted = _painted(casters)
+    least = int(not (np.diff(casters.begin) > _numbers(painted))[selected].any())
     for one in of.painted:
         if one.is_of(sent, painted, selected, least):
             return one
@@ -80,11 +87,10 @@ class LightByMasks:
         share = of.shares()
         number = 1 << _numbers(self._painted)
         records, casters, values = [self.entries.record], [self.entries.caster], [self.entries.values]
-        for rays, _, owner in of.chunks():
+        for rays, owner, table in of.tables():
             some = new[owner]
             if not some.any():
                 continue
-            table = ray_table(rays)
             row, caster, local, begin = list_of_casters(rays, table, self._selected, some)
             first = np.concatenate([[0], np.cumsum(number[caster])])
             light = np.zeros((int(first[-1]), *self.entries.values.shape[1:]), np.float32)
@@ -127,9 +133,23 @@ def _painted(casters: MaskTable) -> MaskTable:
     """Painted entries alone."""
     some = casters.mask >= 0
     begin = np.concatenate([[0], np.cumsum(some)])[casters.begin]
-    columns = {name: getattr(casters, name)[some] for name in ("row", "weight", "mask", "first_face")}
+    columns = {name: getattr(casters, name)[some] for name in ("row", "weight", "mask", "first_face", "n_faces")}
     return casters._replace(begin=begin, **columns)
 
 
 def _numbers(painted: MaskTable) -> I64:
     return np.diff(painted.begin)
+
+
+def list_of_casters(
+    rays: RecordRays, table: RayTable, selected: Bool, some: Bool
+) -> tuple[I64, I32, NDArray[np.int16], I64]:
+    """Row and instance of every pair of a row and what it sees, place of each ray's among its row's, pairs by row."""
+    n, n_rays = rays.cell.shape
+    local = np.empty((n, n_rays), np.int16)
+    listed = np.empty((n, min(int(selected.sum()), n_rays)), np.int32)
+    number = np.empty(n, np.int32)
+    list_casters(table, selected.view(np.uint8), some.view(np.uint8), local, number, listed)
+    begin = np.concatenate([[0], np.cumsum(number, dtype=np.int64)])
+    row = np.repeat(np.arange(n), number)
+    return row, listed[row, np.arange(len(row)) - begin[row]], local, begin

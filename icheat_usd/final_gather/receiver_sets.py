@@ -12,6 +12,7 @@ import numpy as np
 
 from icheat_usd.edits.bound import Ends
 from icheat_usd.edits.field import EditField
+from icheat_usd.kernels.mask_table import any_positive
 from icheat_usd.scene import F32, I32, I64, U8, Bool, SurfacePoints
 
 #: Masks of one receiver between 0 and 1; with more, mixtures would be of more than 16 sets.
@@ -53,11 +54,14 @@ def touched(field: EditField, points: SurfacePoints) -> Touched:
         return Touched(field, where, some.masks, np.arange(len(where)), some)
     selections = [receivers for bound in field.edits for receivers in bound.receivers]
     if not all(receivers.constant_on_instances for receivers in selections):
-        masks = field.receiver_masks(points).T
-        where = np.flatnonzero((masks > 0).any(axis=1))
-        return Touched(
-            field, where, (masks if len(where) == len(masks) else masks[where]).T, np.arange(len(where)), None
-        )
+        masks = np.ascontiguousarray(field.receiver_masks(points).T)
+        is_in = np.empty(len(masks), np.uint8)
+        any_positive(masks, is_in)
+        where = np.flatnonzero(is_in)
+        if 2 * len(where) > len(masks):
+            # To copy them would take longer than to carry the others along.
+            return Touched(field, where, masks.T, where, None)
+        return Touched(field, where, masks[where].T, np.arange(len(where)), None)
     on_instances = np.stack([selection.on_instances for selection in selections]).astype(np.float32)
     columns, of_instance = np.unique(on_instances, axis=1, return_inverse=True)
     acts: Bool = np.asarray((columns > 0).any(axis=0), np.bool_)

@@ -1,4 +1,4 @@
-"""What hemispheres of rays bring from each caster: `record_sums`, split by sender."""
+"""Rays of hemispheres, how much each of them counts in irradiance and its gradients, and which casters they see."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.samples import basis
-from icheat_usd.kernels.simd import address_of, color_product, load_color, load_rgb, scale_add, store_color
+from icheat_usd.kernels.simd import load_color, scale_add, store_color
 
 #: Irradiance, its change with ``normal x other normal`` and with place: colours of a record's light.
 N_VALUES = 7
@@ -53,32 +52,34 @@ def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: 
     out : (n_rays, 4) float32, out
     """
     m, n = n_theta, n_phi
-    close = np.empty(m * n, np.float32)
-    slope, low, width = np.empty(m), np.zeros(m + 1), np.empty(m)
-    for j in range(m):
-        u = (j + 0.5) / m
-        slope[j] = np.pi / (m * n) * factor * np.sqrt(u / (1.0 - u))
-        low[j] = (1.0 - j / m) * np.sqrt(j / m) * (2.0 * np.pi / n) * factor
-        width[j] = factor * (np.sqrt((j + 1) / m) - np.sqrt(j / m))
+    close, azimuth = np.empty(m * n, np.float32), np.empty((n + 1, 4), np.float32)
     for ray in range(m * n):
         close[ray] = np.float32(1.0) / max(distance[r, ray], _TOUCHING)
-    for k in range(n):
-        phi = 2.0 * np.pi * ((k + 0.5) / n + first_turn)
-        edge, next_edge = 2.0 * np.pi * (k / n + first_turn), 2.0 * np.pi * ((k + 1) / n + first_turn)
-        across, along = np.cos(phi), np.sin(phi)
-        edge_across, edge_along = np.cos(edge), np.sin(edge)
-        next_across, next_along = np.cos(next_edge), np.sin(next_edge)
-        before, after = (k - 1 if k > 0 else n - 1), (k + 1 if k + 1 < n else 0)
-        for j in range(m):
+    # Middles and edges of sectors, each a turn of the one before.
+    cos, sin = np.cos(2.0 * np.pi / n), np.sin(2.0 * np.pi / n)
+    across, along = np.cos(2.0 * np.pi * (0.5 / n + first_turn)), np.sin(2.0 * np.pi * (0.5 / n + first_turn))
+    edge_across, edge_along = np.cos(2.0 * np.pi * first_turn), np.sin(2.0 * np.pi * first_turn)
+    for k in range(n + 1):
+        azimuth[k, 0], azimuth[k, 1], azimuth[k, 2], azimuth[k, 3] = across, along, edge_across, edge_along
+        across, along = across * cos - along * sin, along * cos + across * sin
+        edge_across, edge_along = edge_across * cos - edge_along * sin, edge_along * cos + edge_across * sin
+    for j in range(m):
+        u = (j + 0.5) / m
+        slope = np.float32(np.pi / (m * n) * factor * np.sqrt(u / (1.0 - u)))
+        sector = 2.0 * np.pi / n * factor
+        # Nothing is inside of the first ring, or outside of the last.
+        low = np.float32((1.0 - j / m) * np.sqrt(j / m) * sector)
+        high = np.float32((1.0 - (j + 1) / m) * np.sqrt((j + 1) / m) * sector)
+        inside, outside = (j * n - n if j > 0 else j * n), (j * n + n if j + 1 < m else j * n)
+        width = np.float32(factor * (np.sqrt((j + 1) / m) - np.sqrt(j / m)))
+        there = width * max(close[j * n], close[j * n + n - 1])
+        for k in range(n):
             ray = j * n + k
-            # Nothing is inside of the first ring, or outside of the last.
-            step = low[j] * max(close[ray], close[ray - n if j > 0 else ray])
-            step -= low[j + 1] * max(close[ray], close[ray + n if j + 1 < m else ray])
-            here = width[j] * max(close[ray], close[j * n + before])
-            there = width[j] * max(close[ray], close[j * n + after])
-            out[ray, 0], out[ray, 1] = -along * slope[j], across * slope[j]
-            out[ray, 2] = across * step - edge_along * here + next_along * there
-            out[ray, 3] = along * step + edge_across * here - next_across * there
+            here, there = there, width * max(close[ray], close[ray + 1 if k + 1 < n else j * n])
+            step = low * max(close[ray], close[inside + k]) - high * max(close[ray], close[outside + k])
+            out[ray, 0], out[ray, 1] = -azimuth[k, 1] * slope, azimuth[k, 0] * slope
+            out[ray, 2] = azimuth[k, 0] * step - azimuth[k, 3] * here + azimuth[k + 1, 3] * there
+            out[ray, 3] = azimuth[k, 1] * step + azimuth[k, 2] * here - azimuth[k + 1, 2] * there
 
 
 @kernel
@@ -148,52 +149,3 @@ def _list_row(r, rays, selected, local, number, listed):  # type: ignore[no-unty
             last = i
         local[r, ray] = place
     number[r] = n
-
-
-@parallel_kernel
-def caster_sums(rays, sent, local, begin, share, seed, n_theta, n_phi, out):  # type: ignore[no-untyped-def]
-    """`record_sums.record_sums` of the light of each caster alone.
-
-    Parameters
-    ----------
-    sent : (n_cells, n_blocks, 4) float32
-        What cells send, by group of lights.
-    local : (n, n_rays) int16, as of `list_casters`
-    begin : (n + 1,) int64
-        Row of the first caster of each hemisphere in the output.
-    share : (n,) float32
-        Factor on each hemisphere.
-    out : (m, n_blocks, N_VALUES, 4) float32, out, zero before
-    """
-    for r in prange(len(begin) - 1):
-        if begin[r] < begin[r + 1]:
-            first_turn = turn_of(seed, rays.stream[r])
-            _sums_of_row(r, rays, sent, local, begin[r], begin[r + 1], share[r], first_turn, n_theta, n_phi, out)
-
-
-@kernel
-def _sums_of_row(r, rays, sent, local, begin, end, factor, first_turn, n_theta, n_phi, out):  # type: ignore[no-untyped-def]
-    cell, adjusted_ray = rays.cell, rays.adjusted
-    n_rays, n_blocks = cell.shape[1], sent.shape[1]
-    weights = np.empty((n_rays, 4), np.float32)
-    ray_weights(rays.distance, r, first_turn, n_theta, n_phi, factor, weights)
-    sums = np.zeros((end - begin, n_blocks, 5, 4), np.float32)
-    sums_0, sent_0, throughput_0 = address_of(sums), address_of(sent), address_of(rays.throughput)
-    share = np.float32(np.pi / n_rays * factor)
-    adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
-    for ray in range(n_rays):
-        is_adjusted = adjusted < adjusted_end and adjusted_ray[adjusted] == r * n_rays + ray
-        if is_adjusted:
-            adjusted += 1
-        place = np.int64(local[r, ray])
-        if place < 0:
-            continue
-        for block in range(n_blocks):
-            light = load_color(sent_0 + 16 * (np.int64(cell[r, ray]) * n_blocks + block))
-            if is_adjusted:
-                light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
-            add_weighted(sums_0 + 80 * (place * n_blocks + block), light, share, weights, ray)
-    nx, ny, nz = rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2]
-    for e in range(end - begin):
-        for block in range(n_blocks):
-            turn_to_world(sums[e, block], nx, ny, nz, out[begin + e, block])

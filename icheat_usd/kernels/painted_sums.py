@@ -25,20 +25,24 @@ from icheat_usd.kernels.simd import (
 from icheat_usd.kernels.texels import corner_texels, texel_weight
 
 #: Painted masks on one caster; with more, there are more subsets than it takes to look at the rays again.
-MOST_PAINTED = 3
+MOST_PAINTED = 1
 
 
 @parallel_kernel
 def painted_sums(  # type: ignore[no-untyped-def]
     rays, face, face_uv, sent, local, begin, first, caster, share, painted, least, seed, n_theta, n_phi, out
 ):
-    """`caster_sums.caster_sums` times the weights of subsets of painted masks.
+    """What rays bring to records by caster, times the weights of subsets of its painted masks.
 
     Parameters
     ----------
     face : (n_triangles,) int32, face_uv : (n_triangles, 3, 2) float32
         Control faces, and places of corners in them.
-    sent, local, share : as of `caster_sums`
+    sent : (n_cells, n_blocks, 4) float32
+        What cells send, by group of lights.
+    local : (n, n_rays) int16, as of `list_casters`
+    share : (n,) float32
+        Factor on each hemisphere.
     begin : (n + 1,) int64
         Entries of each hemisphere, one for each caster.
     first : (m + 1,) int64

@@ -243,6 +243,51 @@ def _choose(  # type: ignore[no-untyped-def]
         centre[e] = best
 
 
+@kernel
+def number_slots(centre, pair, known, new, slot):  # type: ignore[no-untyped-def]
+    """Numbers of the slots that `choose_slots` chose; how many of them are new.
+
+    Parameters
+    ----------
+    centre : (n_pairs,) int64, as of `choose_slots`
+    pair : (n_pairs,) int64, as of `list_pairs`
+    known : int
+        How many slots there are already.
+    new : (n_pairs,) int64, out
+        Pair that each new slot is of.
+    slot : (n_pairs,) int64, out
+        Slot of every pair in the order of places.
+    """
+    n = 0
+    for e in range(len(centre)):
+        if centre[e] == e:
+            new[n] = e
+            n += 1
+            slot[pair[e]] = known + n - 1
+        elif centre[e] < 0:
+            slot[pair[e]] = -1 - centre[e]
+        else:
+            slot[pair[e]] = slot[pair[centre[e]]]
+    return n
+
+
+@parallel_kernel
+def rows_in(masks, acts, out):  # type: ignore[no-untyped-def]
+    """Bits of the rows that act in columns of masks (k, n_rows), into words (k, n_words)."""
+    for k in prange(len(masks)):
+        _rows_in(k, masks, acts, out)
+
+
+@kernel
+def _rows_in(k, masks, acts, out):  # type: ignore[no-untyped-def]
+    for word in range(out.shape[1]):
+        found = np.uint64(0)
+        for row in range(64 * word, min(64 * word + 64, masks.shape[1])):
+            if masks[k, row] > np.float32(0.0) and acts[row]:
+                found |= np.uint64(1) << np.uint64(row & 63)
+        out[k, word] = found
+
+
 @parallel_kernel
 def mix_slots(  # type: ignore[no-untyped-def]
     at,

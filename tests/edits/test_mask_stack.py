@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.edits.bound import Ends
+from icheat_usd.edits.mask_sheets import sheets_of_many
 from icheat_usd.edits.mask_stack import is_of_masks, looks_at_hits, mask_stack
 from icheat_usd.edits.mask_table import mask_table, weights_of
 from icheat_usd.edits.model import Blend, Edit
@@ -60,7 +61,7 @@ def test_tables_hold_the_weights_of_selections():
     for side in ("receivers", "casters"):
         selections = [selection for bound in field.edits for selection in getattr(bound, side)]
         table = mask_table(selections, parts.snapshot.n_instances)
-        found = weights_of(table, len(selections), parts.view.points)
+        found = weights_of(table, sheets_of_many(table), len(selections), parts.view.points)
         expected = np.stack([selection.at(parts.view.points) for selection in selections], axis=1)
         np.testing.assert_array_equal(found, expected)
         assert 0 < (found > 0).mean() < 1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.edits.model import Blend, Edit, KeyedPayload, Payload, SurfaceMask
-from icheat_usd.final_gather import GatherSettings, final_gather, masked_records
+from icheat_usd.final_gather import GatherSettings, final_gather, merged_light, slot_choices
 from icheat_usd.final_gather.edited_records import EditedRecords
 from tests.final_gather.test_edits import BLEED, DIM, EVERYTHING, GREY, SIDES, WHITE, painted, previews, soft
 from tests.final_gather.test_rows import FLOOR, baked
@@ -29,6 +29,15 @@ BRUSHED = (
     brushed("/b", "emit", (0.2, 0.3, 0.1), 4),
     brushed("/c", "scale", (0.1, 2.0, 4.0), 5),
 )
+
+
+#: More on one caster than subsets are kept of, beside edits of the whole of it.
+MANY = (*BRUSHED, *(brushed(f"/{k}", "scale", (0.5, 1.5, 1.0 + 0.2 * k), 6 + k) for k in range(3)), BLEED)
+
+
+def take_rays_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless they end where masks weigh the same."""
+    monkeypatch.setattr(merged_light, "LEAST_APART", 0.0)
 
 
 def rows(**changed: object) -> Edit:
@@ -85,16 +94,39 @@ def test_a_render_that_is_not_kept_has_no_replay():
 
 
 @pytest.mark.parametrize("name", OF_MASKS)
-@pytest.mark.parametrize("change, tolerance", [(0.0, 2e-4), (masked_records.MOST_CHANGE, 5e-3)])
+@pytest.mark.parametrize("change, tolerance", [(0.0, 2e-4), (slot_choices.MOST_CHANGE, 5e-3)])
 def test_light_under_masks_is_the_light_of_the_rays(name, change, tolerance, monkeypatch):
-    """With masks for every place, and with those of places near it; and edited ray by ray."""
-    monkeypatch.setattr(masked_records, "MOST_CHANGE", change)
+    """With masks for every place and every ray, and with those of places near it; and edited ray by ray."""
+    monkeypatch.setattr(slot_choices, "MOST_CHANGE", change)
+    if change == 0.0:
+        take_rays_one_by_one(monkeypatch)
     fast = rendered(*STACKS[name]).indirect_edited
     for module in ("final_gather.edited_records", "edits.mask_stack"):
         monkeypatch.setattr(f"icheat_usd.{module}.is_of_masks", lambda field: False)
     slow = rendered(*STACKS[name]).indirect_edited
     assert (fast != slow).any()
     np.testing.assert_allclose(fast, slow, rtol=tolerance, atol=1e-6)
+
+
+def smooth(path: str, seed: int) -> SurfaceMask:
+    """A mask that falls from one side of each face to the other."""
+    mask = soft(path, seed)
+    a, b, c = np.random.default_rng(seed).uniform(0, 1, 3)
+    x = np.linspace(0, 1, 4, dtype=np.float32)
+    texels = np.clip(c + (a - 0.5) * x[:, None] + (b - 0.5) * x[None, :], 0, 1).astype(np.float32)
+    return SurfaceMask(mask.surfaces, np.broadcast_to(texels, mask.texels.shape).copy())
+
+
+def smoothly(n: int) -> list[Edit]:
+    """From smoothly painted places on a side wall to everything."""
+    edits = []
+    for i in range(n):
+        parameters = {"color": tuple(np.random.default_rng(i).uniform(0.4, 2.0, 3).tolist())}
+        payload = Payload("scale", parameters, caster_mask=smooth("/red", i))
+        edits.append(
+            Edit(f"/smooth{i}", "scale", parameters, EVERYTHING, select("/red"), keys=(KeyedPayload(payload, 1.0),))
+        )
+    return edits
 
 
 def rows_and_others() -> tuple[Edit, ...]:
@@ -122,13 +154,14 @@ def changed_stacks(edits: tuple[Edit, ...]) -> list[tuple[Edit, ...]]:
     [
         BRUSHED[:1],
         BRUSHED,
+        MANY,
         (rows(),),
         (rows(), rows(path="/again", amount=0.5)),
         rows_and_others(),
         recipes()[:1],
         recipes(),
     ],
-    ids=["brush", "brushes", "rows", "rows over rows", "rows and others", "recipe", "recipes"],
+    ids=["brush", "brushes", "many brushes", "rows", "rows over rows", "rows and others", "recipe", "recipes"],
 )
 def test_changed_edits_replay_as_they_render(edits):
     kept = rendered(*edits, is_kept=True)
@@ -164,7 +197,9 @@ def test_a_changed_mask_replays_as_it_renders():
     np.testing.assert_array_equal(replayed, rendered(*changed).indirect_edited)
 
 
-@pytest.mark.parametrize("edits", [BRUSHED, (rows(),), recipes()[:1]], ids=["brushes", "rows", "recipe"])
+@pytest.mark.parametrize(
+    "edits", [BRUSHED, MANY, (rows(),), recipes()[:1]], ids=["brushes", "many brushes", "rows", "recipe"]
+)
 def test_rays_are_not_looked_at_again_for_a_changed_amount(edits, monkeypatch):
     kept = rendered(*edits, is_kept=True)
 
@@ -172,10 +207,24 @@ def test_rays_are_not_looked_at_again_for_a_changed_amount(edits, monkeypatch):
         raise AssertionError("rays were looked at")
 
     monkeypatch.setattr("icheat_usd.kernels.painted_sums.painted_sums", refuse)
+    monkeypatch.setattr("icheat_usd.kernels.merged_rays.merge_rays", refuse)
     monkeypatch.setattr("icheat_usd.kernels.row_light.row_sums", refuse)
     monkeypatch.setattr("icheat_usd.final_gather.pair_tables.pair_sums", refuse)
     for changed in changed_stacks(edits)[:2]:
         assert (kept.replay.edited(previews()[0].field(*changed)) != kept.indirect_edited).any()
+
+
+@pytest.mark.parametrize("exactly, tolerance", [(True, 2e-4), (False, 1e-2)])
+@pytest.mark.parametrize("edits", [MANY, tuple(smoothly(6))], ids=["rough masks", "smooth masks"])
+def test_rays_taken_together_bring_the_light_of_the_rays(edits, exactly, tolerance, monkeypatch):
+    if exactly:
+        take_rays_one_by_one(monkeypatch)
+    fast = rendered(*edits).indirect_edited
+    for module in ("final_gather.edited_records", "edits.mask_stack"):
+        monkeypatch.setattr(f"icheat_usd.{module}.is_of_masks", lambda field: False)
+    slow = rendered(*edits).indirect_edited
+    assert np.abs(slow - rendered().indirect).max() > 0.05 * slow.max()
+    np.testing.assert_allclose(fast, slow, rtol=tolerance, atol=1e-6)
 
 
 def overlapping_brushes(n: int) -> tuple[Edit, ...]:
@@ -189,25 +238,32 @@ def overlapping_brushes(n: int) -> tuple[Edit, ...]:
     return tuple(edits)
 
 
-def smooth(path: str, seed: int) -> SurfaceMask:
-    """A mask that falls from one side of each face to the other."""
-    mask = soft(path, seed)
-    a, b, c = np.random.default_rng(seed).uniform(0, 1, 3)
-    x = np.linspace(0, 1, 4, dtype=np.float32)
-    texels = np.clip(c + (a - 0.5) * x[:, None] + (b - 0.5) * x[None, :], 0, 1).astype(np.float32)
-    return SurfaceMask(mask.surfaces, np.broadcast_to(texels, mask.texels.shape).copy())
-
-
 def test_brushes_that_overlap_are_those_of_places_with_masks_of_their_own(monkeypatch):
     """Twelve soft masks a receiver, and twelve a caster: more than sets of edits could be mixed for."""
     edits = overlapping_brushes(12)
     near = rendered(*edits)
-    monkeypatch.setattr(masked_records, "MOST_CHANGE", 0.0)
+    monkeypatch.setattr(slot_choices, "MOST_CHANGE", 0.0)
     exact = rendered(*edits)
     changed = np.abs(exact.indirect_edited - exact.indirect)
     assert changed.max() > 0.05 * exact.indirect.max()
     assert (near.indirect_edited != exact.indirect_edited).any()
     np.testing.assert_allclose(near.indirect_edited, exact.indirect_edited, rtol=2e-3)
+
+
+def test_slots_are_not_chosen_again_for_a_changed_amount(monkeypatch):
+    edits = overlapping_brushes(5)
+    kept = rendered(*edits, is_kept=True)
+
+    def refuse(*_, **__):
+        raise AssertionError("slots were chosen")
+
+    amounts = ((0.4, 1.0, 1.0, 1.0, 0.2), (1.0, 0.7, 0.5, 1.0, 1.0))
+    stacks = [[replace(edit, amount=x) for edit, x in zip(edits, some, strict=True)] for some in amounts]
+    with monkeypatch.context() as patch:
+        patch.setattr("icheat_usd.kernels.record_slots.choose_slots", refuse)
+        replayed = [kept.replay.edited(previews()[0].field(*changed)) for changed in stacks]
+    for changed, found in zip(stacks, replayed, strict=True):
+        np.testing.assert_array_equal(found, rendered(*changed).indirect_edited)
 
 
 def test_a_replay_has_the_same_bits_on_one_thread_and_on_two():
@@ -216,7 +272,8 @@ def test_a_replay_has_the_same_bits_on_one_thread_and_on_two():
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
         try:
             kept = rendered(is_kept=True)
-            found.append(kept.replay.edited(previews()[0].field(BLEED, DIM)))
+            replayed = [kept.replay.edited(previews()[0].field(*edits)) for edits in ((BLEED, DIM), MANY)]
+            found.append(np.stack(replayed))
         finally:
             numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     np.testing.assert_array_equal(*found)
