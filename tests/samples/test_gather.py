@@ -6,11 +6,11 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.lighting import build_light_sampler
-from icheat_usd.materials import points_on_surface
+from icheat_usd.lighting import build_light_sampler, irradiance
+from icheat_usd.materials import points_on_surface, take_points
 from icheat_usd.samples import GatherSamples, cell_direct, gather_samples, view_samples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
-from icheat_usd.tracing import build_tracer
+from icheat_usd.tracing import build_tracer, first_surfaces
 from tests.scenes import (
     Light,
     Material,
@@ -18,6 +18,7 @@ from tests.scenes import (
     box,
     closed_box,
     cornell,
+    cornell_meshes,
     look_at,
     make_snapshot,
     quad,
@@ -223,6 +224,57 @@ def test_cells_reflect_the_mean_of_the_light_on_their_patches() -> None:
     np.testing.assert_allclose(direct[0, front], np.broadcast_to(one, (front.sum(), 3)), rtol=1e-5)
     np.testing.assert_allclose(one / one[0], [1, 2, 4], rtol=1e-5)
     assert np.all(direct[0, ~front] == 0)
+
+
+def dark_room() -> SceneSnapshot:
+    """A floor of one piece, half of it in a room without windows; light comes in under the room's right wall."""
+    grey = Material(diffuse=0.5)
+    room = [
+        box((4.2, 0.1, 4.2), (-2, 2.05, 0)),
+        box((0.1, 1.2, 4.2), (0.05, 1.4, 0)),
+        box((0.1, 2, 4.2), (-4.05, 1, 0)),
+        box((4.2, 2, 0.1), (-2, 1, 2.05)),
+        box((4.2, 2, 0.1), (-2, 1, -2.05)),
+    ]
+    meshes = [Mesh(quad(8), grey, path="/floor"), *(Mesh(m, grey, path=f"/wall{i}") for i, m in enumerate(room))]
+    lamp = Light(LightKind.DISTANT, np.pi, rotation((1, 0, 0), -90), (0.0, 0.0))
+    return make_snapshot(meshes, lights=[lamp], camera=look_at((-3.5, 1, 0), (0, 1, 0), fov=80))
+
+
+def test_light_of_cells_is_that_of_the_places_which_the_view_sees() -> None:
+    scene = dark_room()
+    tracer = build_tracer(scene)
+    sampler = build_light_sampler(scene)
+    view = view_samples(scene, tracer)
+    gather = gather_of(scene, 200)
+    own = cell_direct(scene, tracer, sampler, gather, 1, 0)[0]
+    rng = np.random.default_rng(8)
+    start = np.repeat(np.arange(view.n), 64)
+    normal = view.points.normal[start]
+    # A point on a unit ball that touches the plane: directions by the cosine.
+    ball = rng.normal(size=(len(start), 3))
+    towards = (normal + ball / np.linalg.norm(ball, axis=1, keepdims=True)).astype(np.float32)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    origins = view.points.position[start] + np.float32(1e-4) * normal
+    hits = first_surfaces(scene, tracer, origins, towards, 3).points
+    there = np.flatnonzero(hits.instance >= 0)
+    hits = take_points(hits, there)
+    true = irradiance(scene, tracer, sampler, hits, 4, 1)[0].mean() * 0.5 / np.pi
+    assert 0.005 < true < 0.05
+    found = own[gather.locate(hits)].mean()
+    # Cells below the wall reach out of the room: by their areas they send 1.7 times as much.
+    assert found == pytest.approx(true, rel=0.1)
+
+
+def test_seen_places_stay_where_they_are_when_something_moves() -> None:
+    lamp = Mesh(quad(0.5)[:, ::-1], Material(0.0, 1.0), transforms=[translation(0, 0.995, 0)], path="/lamp")
+    found = []
+    for x in (-0.6, 0.6):
+        toy = Mesh(box(0.1), Material(), [translation(x, -0.9, 0.9)], path="/toy")
+        camera = look_at((0, 0, 3.9), (0, 0, 0), fov=39.3, width=16, height=16)
+        patches = gather_of(make_snapshot([*cornell_meshes(), lamp, toy], camera=camera), 500).patch_points.position
+        found.append({tuple(place) for place in patches.tolist()})
+    assert len(found[0] & found[1]) > 0.8 * len(found[0])
 
 
 def test_a_set_without_samples_or_surfaces_is_refused() -> None:
