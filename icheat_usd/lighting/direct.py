@@ -30,6 +30,7 @@ def irradiance(
     points: SurfacePoints,
     seed: int,
     n_samples: int | Sequence[int],
+    sequence: I64 | None = None,
 ) -> F32:
     """Irradiance of every light at surface points, shadowed by the scene.
 
@@ -40,6 +41,9 @@ def irradiance(
     n_samples : int or one int per light
         Shadow rays per point and light; powers of two are stratified best. A distant light without
         an angle takes one.
+    sequence : (n, 2) int64, optional
+        Which sequence of random numbers each point draws from, and how many points draw from it before;
+        one for each point by default.
 
     Returns
     -------
@@ -52,14 +56,14 @@ def irradiance(
     Rectangles are sampled uniformly in solid angle [1]_, spheres in the cone they fill, cylinders over
     the side that is in sight, disks and mesh triangles by area, domes by their image or, without one,
     by the cosine, and by what the sampler's guide has learnt of their visibility. Random numbers depend
-    on (seed, point, light, sample) alone.
+    on (seed, sequence, light, sample) alone.
 
     References
     ----------
     .. [1] Urena, Fajardo, King 2013, An area-preserving parametrization for spherical rectangles.
     """
     counts = _counts(n_samples, len(snapshot.lights.kind))
-    return _direct(snapshot, tracer, sampler, points, seed, counts, None, 1)
+    return _direct(snapshot, tracer, sampler, points, seed, counts, None, 1, sequence)
 
 
 def reflected_direct(
@@ -146,13 +150,15 @@ def _direct(
     counts: Sequence[int],
     to_eye: F32 | None,
     n_specular: int,
+    sequence: I64 | None = None,
 ) -> F32:
     lights = snapshot.lights
     n = len(points.instance)
     out = np.zeros((len(lights.kind), n, 3), np.float32)
-    draws = own_draws(0, n)
+    sequence = own_draws(0, n) if sequence is None else sequence
     for light in np.flatnonzero(nonzero_rows(lights.radiance)).tolist():
         count = 1 if is_delta(snapshot, light) else counts[light]
+        draws = sequence * np.array([1, count])
         add_shadow_rays(
             snapshot, tracer, sampler, points, to_eye, light, draws, seed, count, (count, n_specular), out[light]
         )

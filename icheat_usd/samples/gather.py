@@ -42,6 +42,7 @@ class GatherSamples:
 
     points: SurfacePoints  #: (n,) in the order of the tree's leaves
     area: F32  #: (n,) of the cells, square metres
+    number: I64  #: (n,) what random numbers go by: the same when other surfaces get more samples, or less
     tree: ClusterTree
     patch_points: SurfacePoints  #: (p,) sorted by cell: places that were seen, and some by area
     patch_cell: I32  #: (p,) cell of each patch point, ascending
@@ -149,6 +150,7 @@ def gather_samples(
     return GatherSamples(
         points=points,
         area=cell_area.astype(np.float32),
+        number=_numbers(slots)[shape.order],
         tree=tree,
         patch_points=take_points(patches, by_cell),
         patch_cell=cell[by_cell],
@@ -184,8 +186,11 @@ def cell_direct(
         last = min(first + _CELLS_AT_ONCE, gather.n)
         begin = gather.cell_begin[first : last + 1]
         points = take_points(gather.patch_points, np.arange(begin[0], begin[-1]))
-        chunk_seed = (seed + 0x9E3779B1 * (first // _CELLS_AT_ONCE)) & 0x7FFFFFFF
-        arriving = irradiance(snapshot, tracer, sampler, points, chunk_seed, n_samples)
+        # Patches of a cell share its sequence: together they are stratified, and what happens in another cell is
+        # nothing to it.
+        cell = gather.patch_cell[begin[0] : begin[-1]].astype(np.int64)
+        sequence = np.stack([gather.number[cell], np.arange(begin[0], begin[-1]) - gather.cell_begin[cell]], axis=1)
+        arriving = irradiance(snapshot, tracer, sampler, points, seed, n_samples, sequence)
         reflected = arriving * (effective_albedo(points) / np.float32(np.pi))
         for light, values in enumerate(reflected):
             mean_over_segments(begin - begin[0], np.ascontiguousarray(values), out[light, first:last])
@@ -325,6 +330,13 @@ def _share_out(snapshot: SceneSnapshot, area: F64, importance: F64, n: int) -> _
     without_own[area > 0] = True
     without_own[own // 2] = False
     return _Slots([name[i] for i in order], count, slot_area, members, of_side, shared, int(without_own.sum()))
+
+
+def _numbers(slots: _Slots) -> I64:
+    """A number for each sample as they are spread, by its side and its place among those of this side."""
+    side = np.array([group[0] for group in slots.members])
+    place = np.concatenate([np.arange(count) for count in slots.count.tolist()])
+    return (np.repeat(side, slots.count) * 0x2545F491 + place) & 0x7FFFFFFF
 
 
 def _name(snapshot: SceneSnapshot, side: int) -> tuple[str, ...]:

@@ -73,7 +73,7 @@ def build_bounces(
     rows = builder.measure(
         gather.patch_points,
         gather.cell_begin,
-        np.arange(gather.n, dtype=np.int64),
+        gather.number,
         rays_per_row,
         1,
         progress,
