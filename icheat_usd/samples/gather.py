@@ -37,7 +37,9 @@ class GatherSamples:
     cell counts as it is seen. Where the sun strikes the outside of a window's
     frame and the room sees the inside, an average over the cell's area would
     bring the sun into the room (measured: a room with four windows became 17 %
-    too bright with 16,384 cells, now 2 %).
+    too bright with 16,384 cells, now 2 %). Places that nothing sees count for
+    little: where an edit takes an occluder away, the cells at its foot are
+    those that were in sight.
     """
 
     points: SurfacePoints  #: (n,) in the order of the tree's leaves

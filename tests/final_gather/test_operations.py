@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -22,6 +23,11 @@ from tests.relight.test_operations import PARAMETERS, room
 from tests.scenes import Light, Material, Mesh, look_at, make_snapshot, quad, quads
 
 CURVES = ("gamma", "curve")
+
+
+@functools.cache
+def finer_previews() -> list[Pipeline]:
+    return [replace(pipeline, n_gather=16_384) for pipeline in previews()]
 
 
 @functools.cache
@@ -62,7 +68,10 @@ def assert_both_renderers_agree(pipelines: list[Pipeline], edits: tuple[Edit, ..
 def test_differences_that_operations_make_are_those_of_the_relighter(operation, method):
     if (operation, method) == ("direction", "cached"):
         pytest.skip("its slope is steep: over records as wide as these are in a picture of 16 pixels it is no line")
-    assert_both_renderers_agree(previews(), (edit(operation),), method)
+    # Light of cells is that of their places in sight: of those half under the blocks it is too bright for rays that go
+    # through the blocks, the less the smaller cells are (measured: 11 % with 4,096 of them, 5.5 % with 16,384).
+    pipelines = finer_previews() if operation == "unshadow" else previews()
+    assert_both_renderers_agree(pipelines, (edit(operation),), method)
 
 
 @pytest.mark.parametrize("method", METHODS)
