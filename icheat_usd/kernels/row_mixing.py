@@ -29,7 +29,7 @@ class Lists(NamedTuple):
 
 
 class PackedLists(NamedTuple):
-    """The same, one list after another, rows ascending: in whatever order they came, they are added in this one."""
+    """The same, one list after another, rows ascending."""
 
     begin: NDArray[np.int32]  #: (n_bases * n_payloads + 1,)
     row: NDArray[np.int32]  #: (n_sums,)
@@ -274,11 +274,14 @@ def _mix_block(  # type: ignore[no-untyped-def]
                     if active[one, payload] == 0:
                         continue
                     at_list = base * rows.shape[1] + payload
-                    for i in range(lists.begin[at_list], lists.begin[at_list + 1]):
-                        w = _weight(rows, weights, q, payload, lists.row[i])
-                        if w != np.float32(0.0):
-                            sum_at = sums_at + 64 * np.int64(lists.sum[i])
-                            light = simd.multiply_add(simd.spread(w), simd.load(sum_at), light)
+                    i, end_of_list = lists.begin[at_list], lists.begin[at_list + 1]
+                    for s in range(rows.shape[2]):
+                        row, w = rows[q, payload, s], weights[q, payload, s]
+                        if row < 0 or w == np.float32(0.0):
+                            continue
+                        k_row = _place_in(lists.row, i, end_of_list, row)
+                        sum_at = sums_at + 64 * np.int64(lists.sum[k_row])
+                        light = simd.multiply_add(simd.spread(w), simd.load(sum_at), light)
                 simd.store(mixed_at, light)
                 w = weight[p, k] * share[e]
                 total_r += w * _value(mixed, 0, turn_t, turn_b, move_t, move_b)
@@ -288,12 +291,12 @@ def _mix_block(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _weight(rows, weights, q, payload, row):  # type: ignore[no-untyped-def]
-    w = np.float32(0.0)
-    for s in range(rows.shape[2]):
-        if rows[q, payload, s] == row:
-            w = weights[q, payload, s]
-    return w
+def _place_in(ascending, first, end, row):  # type: ignore[no-untyped-def]
+    """Where a row is listed: how many rows of the list are below it, which no branch needs to guess."""
+    n = first
+    for i in range(first, end):
+        n += np.int32(ascending[i] < row)
+    return n
 
 
 @kernel
