@@ -49,7 +49,9 @@ class CacheSettings:
     most_turn: float = 20.0  #: degrees between normals
     tolerance: float = 0.1  #: relative error of a record's own prediction at another, from which it ends before that
     coverage: float = 0.5  #: sum of weights at a place, 1 at a record itself, from which it needs no record of its own
-    near_paths: int = 0  #: paths from each patch that is nearer than cells resolve; more cells are mostly cheaper
+    #: Paths from each patch that is nearer than cells resolve, 0 for none. A fifth of the time at most; a room with sun
+    #: on its windows had twice the error without.
+    near_paths: int = 4
 
     def __post_init__(self) -> None:
         if self.near_paths < 0:

@@ -24,6 +24,17 @@ def _cached(n_gather: int, bounce_rays: int, light_samples: int, settings: Gathe
 #: By name; every one is rendered by itself and gives one point of a curve.
 EFFORTS: dict[str, RenderEffort] = {
     "brute 4 x 16": RenderEffort(GatherSettings(method="brute", samples_per_pixel=4, gather_rays=16), PREVIEW),
+    "cached quick": _cached(
+        8_192,
+        32,
+        1,
+        GatherSettings(
+            1,
+            light_samples=1,
+            edge_samples=1,
+            cache=CacheSettings(n_theta=8, noise=0.2, least_reach=5.0, coverage=0.3, near_paths=0),
+        ),
+    ),
     "cached 0": _cached(
         16_384,
         64,
