@@ -16,7 +16,6 @@ from icheat_usd.edits.operations.base import (
     Parameter,
     number,
 )
-from icheat_usd.kernels.distances import distance_powers
 
 #: Share of the pivot distance below which pairs count as being this far apart: light with an exponent above 2
 #: would have no bound where receivers touch casters.
@@ -53,6 +52,9 @@ class Falloff(Operation):
         return {**parameters, "pivot": mean if mean > 0 else 1.0}  # Without a mean there are no pairs.
 
     def evaluate(self, parameters: Mapping[str, Value], pairs: Pairs) -> PairCoefficients:
+        # Here, so that edits are read and authored without a compiler.
+        from icheat_usd.kernels.distances import distance_powers
+
         receiver, caster = pairs.receiver.position, pairs.caster.position
         scale = np.empty(max(len(receiver), len(caster)), np.float32)
         pivot, power = np.float32(number(parameters, "pivot")), np.float32(2.0 - number(parameters, "exponent"))
