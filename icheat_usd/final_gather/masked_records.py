@@ -153,7 +153,7 @@ class MaskedRecords:
                 derivative,
             )
         if self._others.any():
-            light = merged_light(of, self._sent, self._others, self._weights.of_entries)
+            light = merged_light(of, self._sent, self._others, self._weights)
             light.find(of, self._snapshot, needed)
             stack_sums.stack_of_casters(
                 light.begin,
@@ -161,7 +161,7 @@ class MaskedRecords:
                 *light.kept,
                 self._casters,
                 self._weights.of_entries.column,
-                self._weights.factor,
+                self._casters.weight,
                 self._stack,
                 slots,
                 records,

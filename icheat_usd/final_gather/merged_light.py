@@ -10,13 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.edits.mask_patches import mask_patches
 from icheat_usd.edits.mask_sheets import EntrySheets, mask_sheets
 from icheat_usd.final_gather.gatherer import GatherSolution
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.record_rays import RecordRays
 from icheat_usd.kernels import merged_rays as kernels
 from icheat_usd.kernels.caster_sums import N_VALUES, RayTable
-from icheat_usd.kernels.mask_sheets import MaskSheets
+from icheat_usd.kernels.mask_patches import MaskPatches
 from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot
 
@@ -28,22 +29,24 @@ _MOST_BYTES = 1 << 25  #: of rays taken together at once
 
 
 class PaintedWeights(NamedTuple):
-    """Where the weights of entries of a table of casters come from."""
+    """Painted weights of a table of casters, and where they are alike."""
 
     of_entries: EntrySheets
-    factor: F32  #: (n_entries,) on the column of each, or the weight itself
+    patches: MaskPatches  #: on which they change light alike
+    plateaus: MaskPatches  #: on which they are the same
 
 
 def painted_weights(casters: MaskTable, on_instances: Bool, steepness: tuple[F32, F32]) -> PaintedWeights:
-    """Masks on some instances (n_instances,), each as large as its row's change of light: `mask_stack.steepness`."""
-    scale, lines = (np.take(of_row, casters.row, axis=0) for of_row in steepness)
-    found = mask_sheets(casters, on_instances, scale, lines)
-    factor = np.where(found.column >= 0, casters.weight / scale, casters.weight)
-    return PaintedWeights(found, factor.astype(np.float32))
+    """Masks on some instances (n_instances,), with rows' changes of light of some size: `mask_stack.steepness`."""
+    n = len(casters.row)
+    found = mask_sheets(casters, on_instances, np.ones(n, np.float32), np.zeros((n, 0), np.float32))
+    changes = mask_sheets(casters, on_instances, *(np.take(of_row, casters.row, axis=0) for of_row in steepness))
+    patches, plateaus = (mask_patches(changes.sheets, apart) for apart in (LEAST_APART, 0.0))
+    return PaintedWeights(found, patches, plateaus)
 
 
 def sent_by_group(solution: GatherSolution, *, with_transport: bool) -> F32:
-    """What gather cells send, (n_cells, n_blocks, 4): a block for each group of lights, the last float of each unused.
+    """What gather cells send, (n_cells, n_blocks, 4): a block for each group of lights, each with its brightness.
 
     Parameters
     ----------
@@ -56,15 +59,16 @@ def sent_by_group(solution: GatherSolution, *, with_transport: bool) -> F32:
     sent[:, :n_groups, :3] = b.transpose(1, 0, 2)
     if with_transport:
         sent[:, n_groups, :3] = 1
+    sent[:, :, 3] = sent[:, :, :3].sum(axis=2)
     return sent
 
 
-def merged_light(of: Hemispheres, sent: F32, selected: Bool, sheets: EntrySheets) -> MergedLight:
+def merged_light(of: Hemispheres, sent: F32, selected: Bool, weights: PaintedWeights) -> MergedLight:
     """What is known of hemispheres when cells send `sent`, from the `selected` (n_instances,) casters at least."""
     for one in of.merged:
-        if one.is_of(sent, selected, sheets.sheets):
+        if one.is_of(sent, selected, weights):
             return one
-    found = MergedLight(sent, selected, sheets, of.n)
+    found = MergedLight(sent, selected, weights, of.n)
     of.merged[:] = [*of.merged[1 - _MOST_KEPT :], found]
     return found
 
@@ -80,9 +84,9 @@ class _Kept(NamedTuple):
 class MergedLight:
     """Light of n records, found when it is first asked for."""
 
-    def __init__(self, sent: F32, selected: Bool, sheets: EntrySheets, n: int) -> None:
-        self._sent, self._selected, self._sheets = sent, selected, sheets.sheets
-        self._width = sheets.width
+    def __init__(self, sent: F32, selected: Bool, weights: PaintedWeights, n: int) -> None:
+        self._sent, self._selected, self._painted = sent, selected, weights
+        self._width = weights.of_entries.width
         self._is_known = np.zeros(n, np.bool_)
         self._record, self._n_kept = np.empty(0, np.int64), 0
         shape = (sent.shape[1], N_VALUES, 4)
@@ -97,14 +101,16 @@ class MergedLight:
         """Entries, and room for more."""
         return self._kept
 
-    def is_of(self, sent: F32, selected: Bool, sheets: MaskSheets) -> bool:
+    def is_of(self, sent: F32, selected: Bool, weights: PaintedWeights) -> bool:
         """Whether it tells of these cells, casters and masks."""
         n_blocks = sent.shape[1]
         # Means of masks are weighted by all that is sent.
         is_enough = self._sent.shape[1] >= n_blocks if self._width == 0 else self._sent.shape[1] == n_blocks
         if not is_enough or (selected & ~self._selected).any() or not np.array_equal(self._sent[:, :n_blocks], sent):
             return False
-        return all(np.array_equal(getattr(self._sheets, name), getattr(sheets, name)) for name in MaskSheets._fields)
+        own, other = self._painted, weights
+        pairs = ((own.of_entries.sheets, other.of_entries.sheets), (own.patches, other.patches))
+        return all(np.array_equal(a, b) for one in pairs for a, b in zip(*one, strict=True))
 
     def find(self, of: Hemispheres, snapshot: SceneSnapshot, needed: Bool) -> None:
         """See to it that some records are known."""
@@ -163,8 +169,9 @@ class MergedLight:
                 some,
                 share,
                 self._selected.view(np.uint8),
-                self._sheets,
-                LEAST_APART,
+                self._painted.of_entries.sheets,
+                self._painted.patches,
+                self._painted.plateaus,
                 rays.seed,
                 rays.n_theta,
                 rays.n_phi,

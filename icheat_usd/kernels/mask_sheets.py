@@ -9,7 +9,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.simd import load_color, scale_add, scaled, store_color
+from icheat_usd.kernels.simd import add_corners, load_color, scale_add, scaled, store_color, weights_of_corners
 from icheat_usd.kernels.texels import corner_texels
 
 
@@ -49,17 +49,44 @@ def weights_in_sheets(begin, resolution, first, widths, i, face, s, t, texels_0,
     texels.
     """
     n = np.int64(0)
-    one = np.float32(1.0)
     for k in range(begin[i], begin[i + 1]):
-        size, width = resolution[k], widths[k]
-        top_left, top_right, left, right, x, y = corner_texels(size, s, t)
-        at = texels_0 + 4 * (first[k] + face * size * size * width)
-        a, b = at + 4 * width * top_left, at + 4 * width * top_right
-        c, d = at + 4 * width * left, at + 4 * width * right
-        for q in range(0, 4 * width, 16):
-            # As `texels.texel_weight`, to the bit.
-            top = scale_add(scaled(load_color(b + q), x), one, scaled(load_color(a + q), one - x))
-            bottom = scale_add(scaled(load_color(d + q), x), one, scaled(load_color(c + q), one - x))
-            store_color(out_0 + 4 * n + q, scale_add(scaled(bottom, y), one, scaled(top, one - y)))
-        n += width
+        weights_in_sheet(resolution[k], first[k], widths[k], face, s, t, texels_0, out_0 + 4 * n)
+        n += widths[k]
     return n
+
+
+@kernel
+def weights_in_sheet(size, first, width, face, s, t, texels_0, out_0):  # type: ignore[no-untyped-def]
+    """The same of one sheet, whose floats begin at `first`."""
+    one = np.float32(1.0)
+    top_left, top_right, left, right, x, y = corner_texels(size, s, t)
+    at = texels_0 + 4 * (first + face * size * size * width)
+    a, b = at + 4 * width * top_left, at + 4 * width * top_right
+    c, d = at + 4 * width * left, at + 4 * width * right
+    for q in range(0, 4 * width, 16):
+        # As `texels.texel_weight`, to the bit.
+        top = scale_add(scaled(load_color(b + q), x), one, scaled(load_color(a + q), one - x))
+        bottom = scale_add(scaled(load_color(d + q), x), one, scaled(load_color(c + q), one - x))
+        store_color(out_0 + q, scale_add(scaled(bottom, y), one, scaled(top, one - y)))
+
+
+@kernel
+def add_weights_in_sheet(size, first, width, face, s, t, factor, texels_0, out_0):  # type: ignore[no-untyped-def]
+    """Columns of one sheet times a factor, added to those at an address."""
+    top_left, top_right, left, _, x, y = corner_texels(size, s, t)
+    corners = scaled(weights_of_corners(x, y), factor)
+    at = texels_0 + 4 * width * (face * size * size + top_left) + 4 * first
+    right, below = 4 * width * (top_right - top_left), 4 * width * (left - top_left)
+    for q in range(at, at + 4 * width, 16):
+        to = out_0 + q - at
+        store_color(
+            to,
+            add_corners(
+                corners,
+                load_color(q),
+                load_color(q + right),
+                load_color(q + below),
+                load_color(q + below + right),
+                load_color(to),
+            ),
+        )

@@ -219,6 +219,14 @@ def store_colors(builder: Any, values: Any) -> None:
     builder.store(colors, _at(builder, values[0], ir.VectorType(_F32, 64)), align=4)
 
 
+@_operation(types.void, types.int64, floats, floats, floats, floats)
+def store_fours(builder: Any, values: Any) -> None:
+    """16 times four float32, one of each vector, to an address."""
+    first, last = (_picked(builder, values[k], values[k + 1], list(range(32))) for k in (1, 3))
+    fours = _picked(builder, first, last, [part * 16 + lane for lane in range(16) for part in range(4)])
+    builder.store(fours, _at(builder, values[0], ir.VectorType(_F32, 64)), align=4)
+
+
 # Four floats: a colour and a pad
 
 
@@ -234,6 +242,17 @@ def color_of(builder: Any, values: Any) -> Any:
     found = ir.Constant(_F4X, [0.0] * 4)
     for lane, value in enumerate(values):
         found = builder.insert_element(found, value, ir.Constant(_I32, lane))
+    return found
+
+
+@_operation(color, types.float32, types.float32)
+def weights_of_corners(builder: Any, values: Any) -> Any:
+    """``(1 - x)(1 - y), x(1 - y), (1 - x)y, xy``."""
+    (x, y), one = values, ir.Constant(_F32, 1.0)
+    left, top = builder.fsub(one, x), builder.fsub(one, y)
+    found = ir.Constant(_F4X, ir.Undefined)
+    for lane, (a, b) in enumerate(((left, top), (x, top), (left, y), (x, y))):
+        found = builder.insert_element(found, builder.fmul(a, b), ir.Constant(_I32, lane))
     return found
 
 
@@ -313,6 +332,23 @@ def scale_add(builder: Any, values: Any) -> Any:
 def color_add(builder: Any, values: Any) -> Any:
     """``a * b + c`` channel by channel, rounded once where the machine can."""
     return _call(builder, "llvm.fmuladd.v4f32", _F4X, *values)
+
+
+@_operation(floats, color, color, floats)
+def add_outer(builder: Any, values: Any) -> Any:
+    """Four colours, each number of `a` times `b`, added to four others; rounded once where the machine can."""
+    numbers = _picked(builder, values[0], values[0], [lane for lane in range(4) for _ in range(4)])
+    colors = _picked(builder, values[1], values[1], [0, 1, 2, 3] * 4)
+    return _call(builder, "llvm.fmuladd.v16f32", _F16X, numbers, colors, values[2])
+
+
+@_operation(color, color, color, color, color, color, color)
+def add_corners(builder: Any, values: Any) -> Any:
+    """Four colours, each times one of the numbers of `weights`, the first, added to the last."""
+    weights, *colors, total = values
+    for lane, value in enumerate(colors):
+        total = _call(builder, "llvm.fmuladd.v4f32", _F4X, value, _picked(builder, weights, weights, [lane] * 4), total)
+    return total
 
 
 @_operation(color, color, color)
