@@ -133,14 +133,12 @@ class MaskedRecords:
         """Changes of light, (n_slots, N_VALUES, 4), and derivatives, (n_derivatives, N_VALUES, 4)."""
         values = np.zeros((len(record), stack_sums.N_VALUES, 4), np.float32)
         derivative = np.zeros((int(slots.derived[-1]), stack_sums.N_VALUES, 4), np.float32)
-        needed = np.diff(slots.begin) > 0
-        records = np.flatnonzero(needed)
-        if of is self._hemispheres:
-            # Rays of all are looked through once; other bands of the image will ask for the rest.
-            needed |= self._choices.likely()
+        wanted = np.diff(slots.begin) > 0
+        # Rays of all are looked through once; other bands of the image will ask for the rest.
+        likely = self._choices.likely() if of is self._hemispheres else wanted
         if self._of_few.any():
             known = light_by_masks(of, self._sent, self._casters, self._of_few)
-            known.find(of, self._snapshot.geometry, needed)
+            known.find(of, self._snapshot.geometry, wanted | likely)
             painted_sums.stack_of_painted(
                 known.begin,
                 *known.entries[1:],
@@ -148,26 +146,26 @@ class MaskedRecords:
                 self._casters,
                 self._stack,
                 slots,
-                records,
+                np.flatnonzero(wanted),
                 values,
                 derivative,
             )
         if self._others.any():
             light = merged_light(of, self._sent, self._others, self._weights)
-            light.find(of, self._snapshot, needed)
-            stack_sums.stack_of_casters(
-                light.begin,
-                light.entry,
-                *light.kept,
-                self._casters,
-                self._weights.of_entries.column,
-                self._casters.weight,
-                self._stack,
-                slots,
-                records,
-                values,
-                derivative,
-            )
+            for table in light.tables(of, self._snapshot, wanted, likely):
+                stack_sums.stack_of_casters(
+                    table.begin,
+                    table.entry,
+                    *table.rows,
+                    self._casters,
+                    self._weights.of_entries.column,
+                    self._casters.weight,
+                    self._stack,
+                    slots,
+                    np.flatnonzero(wanted & table.has),
+                    values,
+                    derivative,
+                )
         shrink = np.take(of.shrink, record)
         values[:, 4:] *= shrink[:, None, None]
         derivative[:, 4:] *= np.repeat(shrink, np.diff(slots.derived))[:, None, None]

@@ -6,6 +6,7 @@ the receivers.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +24,10 @@ from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot
 
 #: Difference in the change of light, by all masks of a caster together, from which on rays are kept apart.
 LEAST_APART = 0.4
-#: Tables of light that are kept for other stacks.
-_MOST_KEPT = 32
-_MOST_BYTES = 1 << 25  #: of rays taken together at once
+#: Stacks whose light is kept for others, and memory for all of it: of rough masks no two rays are taken together.
+_MOST_KEPT, MOST_BYTES = 32, 1 << 29
+_MOST_OF_TABLE, _MOST_OF_SCRATCH = 1 << 27, 1 << 24  #: bytes
+_PILOT = 1 << 16  #: rays of the first table, which tells how many are left of others
 
 
 class PaintedWeights(NamedTuple):
@@ -73,33 +75,39 @@ def merged_light(of: Hemispheres, sent: F32, selected: Bool, weights: PaintedWei
     return found
 
 
-class _Kept(NamedTuple):
-    """Light of rays taken together."""
+class LightTable(NamedTuple):
+    """Light of some of n records: rays of theirs taken together."""
 
+    has: Bool  #: (n,) those records
+    begin: I64  #: (n + 1,)
+    entry: I64  #: (m,) rows of record r are ``entry[begin[r]:begin[r + 1]]``
+    rows: _Rows
+
+    @property
+    def n_bytes(self) -> int:
+        return sum(column.nbytes for column in (self.entry, *self.rows))
+
+
+class _Rows(NamedTuple):
     caster: I32  #: (m,)
     weights: F32  #: (m, width) of the caster's masks
     light: F32  #: (m, n_blocks, N_VALUES, 4)
 
 
 class MergedLight:
-    """Light of n records, found when it is first asked for."""
+    """Light of n records, found when it is first asked for, and kept as far as there is room."""
 
     def __init__(self, sent: F32, selected: Bool, weights: PaintedWeights, n: int) -> None:
         self._sent, self._selected, self._painted = sent, selected, weights
         self._width = weights.of_entries.width
-        self._is_known = np.zeros(n, np.bool_)
-        self._record, self._n_kept = np.empty(0, np.int64), 0
-        shape = (sent.shape[1], N_VALUES, 4)
-        self._kept = _Kept(
-            np.empty(0, np.int32), np.empty((0, self._width), np.float32), np.empty((0, *shape), np.float32)
-        )
-        self.begin = np.zeros(n + 1, np.int64)  #: entries of each record
-        self.entry = np.empty(0, np.int64)  #: (m,) where they are among what is kept
+        self._kept: list[LightTable] = []
+        self._is_kept, self._is_full = np.zeros(n, np.bool_), False
+        self._n_rays = self._n_rows = 0  # that have been looked at, and what was left of them
 
     @property
-    def kept(self) -> _Kept:
-        """Entries, and room for more."""
-        return self._kept
+    def n_bytes(self) -> int:
+        """Memory that is kept."""
+        return sum(table.n_bytes for table in self._kept)
 
     def is_of(self, sent: F32, selected: Bool, weights: PaintedWeights) -> bool:
         """Whether it tells of these cells, casters and masks."""
@@ -112,27 +120,92 @@ class MergedLight:
         pairs = ((own.of_entries.sheets, other.of_entries.sheets), (own.patches, other.patches))
         return all(np.array_equal(a, b) for one in pairs for a, b in zip(*one, strict=True))
 
-    def find(self, of: Hemispheres, snapshot: SceneSnapshot, needed: Bool) -> None:
-        """See to it that some records are known."""
-        new = needed & ~self._is_known
-        if not new.any():
+    def tables(self, of: Hemispheres, snapshot: SceneSnapshot, wanted: Bool, likely: Bool) -> Iterator[LightTable]:
+        """Tables that hold each of the `wanted` records once.
+
+        What is not kept is looked at again whenever it is wanted.
+
+        Parameters
+        ----------
+        wanted, likely : (n,)
+            Records; those that are likely to be wanted are kept, too, if there is room.
+        """
+        for table in list(self._kept):
+            if (table.has & wanted).any():
+                yield table
+        number = np.zeros(of.n, np.int64)
+        for rays, owner, _ in of.tables():
+            number += rays.n_rays * np.bincount(owner, minlength=of.n)
+        left = np.flatnonzero((wanted | likely) & ~self._is_kept & (number > 0))
+        scratch: dict[int, F32] = {}
+        while len(left):
+            if self._is_full:
+                left = left[wanted[left]]
+            n = int(np.searchsorted(np.cumsum(number[left]), self._rays_at_once(), side="right"))
+            has = np.zeros(of.n, np.bool_)
+            has[left[: max(n, 1)]] = True
+            left = left[max(n, 1) :]
+            table = self._table(of, snapshot, has, int(number[has].sum()), scratch)
+            self._keep(table, of)
+            if (has & wanted).any():
+                yield table
+
+    def _keep(self, table: LightTable, of: Hemispheres) -> None:
+        """Keep a table if there is room; what stacks before have kept is given up first."""
+        others = [one for one in of.merged if one is not self]
+        while others and table.n_bytes + sum(one.n_bytes for one in (*others, self)) > MOST_BYTES:
+            del others[0]
+        if table.n_bytes + self.n_bytes > MOST_BYTES:
+            self._is_full = True
             return
-        self._is_known |= new
-        records, left = [self._record], int(new[np.concatenate([part.owner for part in of.parts])].sum())
+        of.merged[:] = [one for one in of.merged if one is self or one in others]
+        self._kept.append(table)
+        self._is_kept |= table.has
+
+    def _row_bytes(self) -> int:
+        return 4 * (1 + self._width + self._sent.shape[1] * N_VALUES * 4)
+
+    def _rays_at_once(self) -> int:
+        """Of a table, by what was left of those before."""
+        if self._n_rays == 0:
+            return _PILOT
+        return int(_MOST_OF_TABLE * self._n_rays / (max(self._n_rows, 1) * self._row_bytes()))
+
+    def _table(
+        self, of: Hemispheres, snapshot: SceneSnapshot, has: Bool, n_rays: int, scratch: dict[int, F32]
+    ) -> LightTable:
+        """What hemispheres of some records bring; `n_rays` is how many these have."""
+        share, seen, n_rows = of.shares(), 0, 0
+        rows, records = self._no_rows(0), [np.zeros(0, np.int64)]
         for rays, owner, table in of.tables():
-            order = np.flatnonzero(new[owner])
+            order = np.flatnonzero(has[owner])
             if len(order) == 0:
                 continue
             order = order[np.argsort(owner[order], kind="stable")]
             mine = owner[order]
             first = np.append(np.flatnonzero(np.append(True, mine[1:] != mine[:-1])), len(mine))
-            records += self._of_rays(rays, table, order, first, mine[first[:-1]], of.shares(), snapshot, left)
-            left -= len(order)
-        self._record = np.concatenate(records)
-        self.entry = np.argsort(self._record, kind="stable")
-        self.begin = np.searchsorted(self._record[self.entry], np.arange(of.n + 1))
+            for record, number, found, n_seen in self._merged(
+                rays, table, order, first, mine[first[:-1]], share, snapshot, scratch
+            ):
+                n, seen = int(number.sum()), seen + n_seen
+                if n_rows + n > len(rows.caster):
+                    grown = self._no_rows(max(n_rows + n, int(1.1 * (n_rows + n) * n_rays / seen)))
+                    for column, before in zip(grown, rows, strict=True):
+                        column[:n_rows] = before[:n_rows]
+                    rows = grown
+                kernels.keep(n_rows + np.cumsum(number), number, *found, *rows)
+                records.append(np.repeat(record, number))
+                n_rows += n
+        self._n_rays, self._n_rows = self._n_rays + n_rays, self._n_rows + n_rows
+        of_row = np.concatenate(records)
+        entry = np.argsort(of_row, kind="stable")
+        return LightTable(has, np.searchsorted(of_row[entry], np.arange(of.n + 1)), entry, rows)
 
-    def _of_rays(
+    def _no_rows(self, n: int) -> _Rows:
+        shape = (n, self._sent.shape[1], N_VALUES, 4)
+        return _Rows(np.empty(n, np.int32), np.empty((n, self._width), np.float32), np.empty(shape, np.float32))
+
+    def _merged(
         self,
         rays: RecordRays,
         table: RayTable,
@@ -141,24 +214,22 @@ class MergedLight:
         record: I64,
         share: F32,
         snapshot: SceneSnapshot,
-        left: int,
-    ) -> list[I64]:
-        """Keep what hemispheres ``order[first[k]:first[k + 1]]`` of each record bring; the records of what is kept.
+        scratch: dict[int, F32],
+    ) -> Iterator[tuple[I64, I64, _Rows, int]]:
+        """What hemispheres ``order[first[k]:first[k + 1]]`` of each record bring, for some records after others.
 
-        `left` is how many hemispheres will follow, these among them.
+        Records, how many rows each has, these rows, and how many rays there were.
         """
         geometry = snapshot.geometry
         room = rays.n_rays * int(np.diff(first).max())
         if self._width == 0:
             room = min(room, int(self._selected.sum()))
-        shape = (self._sent.shape[1], N_VALUES, 4)
-        at_once = max(1, _MOST_BYTES // (4 * room * (1 + self._width + int(np.prod(shape)))))
-        found = []
+        at_once = max(1, _MOST_OF_SCRATCH // (room * self._row_bytes()))
         for begin in range(0, len(record), at_once):
             some = record[begin : begin + at_once]
             n = len(some)
-            number, caster = np.empty(n, np.int64), np.empty((n, room), np.int32)
-            weights, light = np.empty((n, room, self._width), np.float32), np.empty((n, room, *shape), np.float32)
+            number = np.empty(n, np.int64)
+            found = self._scratch(n, room, scratch)
             kernels.merge_rays(
                 table,
                 geometry.face,
@@ -176,24 +247,17 @@ class MergedLight:
                 rays.n_theta,
                 rays.n_phi,
                 number,
-                caster,
-                weights,
-                light,
+                *found,
             )
-            ends = self._n_kept + np.cumsum(number)
-            share_left = (left - first[begin]) / (first[begin + n] - first[begin])
-            self._make_room(int(ends[-1]), int(share_left * number.sum()))
-            kernels.keep(ends, number, caster, weights, light, *self._kept)
-            self._n_kept = int(ends[-1])
-            found.append(np.repeat(some, number))
-        return found
+            yield some, number, found, rays.n_rays * int(first[begin + n] - first[begin])
 
-    def _make_room(self, n: int, more: int) -> None:
-        """See to it that there is room for `n` entries; if there is not, for `more` than there are."""
-        if n <= len(self._kept.caster):
-            return
-        room = max(n, self._n_kept + more + more // 8)
-        grown = _Kept(*(np.empty((room, *column.shape[1:]), column.dtype) for column in self._kept))
-        for column, before in zip(grown, self._kept, strict=True):
-            column[: self._n_kept] = before[: self._n_kept]
-        self._kept = grown
+    def _scratch(self, n: int, room: int, before: dict[int, F32]) -> _Rows:
+        """Rows for n records: new memory would take as long as the rays."""
+        shapes = ((n, room), (n, room, self._width), (n, room, self._sent.shape[1], N_VALUES, 4))
+        for number, shape in enumerate(shapes):
+            if number not in before or before[number].size < np.prod(shape):
+                before[number] = np.empty(int(np.prod(shape)), np.float32)
+        caster, weights, light = (
+            before[number][: int(np.prod(shape))].reshape(shape) for number, shape in enumerate(shapes)
+        )
+        return _Rows(caster.view(np.int32), weights, light)

@@ -93,7 +93,7 @@ class LightByMasks:
                 continue
             row, caster, local, begin = list_of_casters(rays, table, self._selected, some)
             first = np.concatenate([[0], np.cumsum(number[caster])])
-            light = np.empty((int(first[-1]), *self.entries.values.shape[1:]), np.float32)
+            light = np.zeros((int(first[-1]), *self.entries.values.shape[1:]), np.float32)
             kernels.painted_sums(
                 table,
                 geometry.face,

@@ -126,13 +126,13 @@ def add_weighted(to, light, share, weights_0, ray):  # type: ignore[no-untyped-d
 
 
 @kernel
-def turn_to_world(sums, tangent, other, to):  # type: ignore[no-untyped-def]
-    """Put values (N_VALUES, 4) of a record to an address, from the five sums (5, 4) about its tangents at another."""
-    store_color(to, load_color(sums))
-    for which in range(2):
-        a, b = load_color(sums + 16 + 32 * which), load_color(sums + 32 + 32 * which)
-        for c in range(3):
-            store_color(to + 16 + 48 * which + 16 * c, scale_add(b, other[c], scaled(a, tangent[c])))
+def turn_to_world(at, tangent, other):  # type: ignore[no-untyped-def]
+    """Values (N_VALUES, 4) of a record at an address, from the five sums (5, 4) about its tangents that are there."""
+    turn_a, turn_b = load_color(at + 16), load_color(at + 32)
+    move_a, move_b = load_color(at + 48), load_color(at + 64)
+    for c in range(3):
+        store_color(at + 16 + 16 * c, scale_add(turn_b, other[c], scaled(turn_a, tangent[c])))
+        store_color(at + 64 + 16 * c, scale_add(move_b, other[c], scaled(move_a, tangent[c])))
 
 
 @parallel_kernel

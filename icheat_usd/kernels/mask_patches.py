@@ -71,6 +71,7 @@ def _patches_of(i, begin, resolution, first, widths, texels, size, first_cell, n
     like, scratch = np.empty((_MOST_LOOKED_AT, width), np.float32), np.empty(4, np.float32)
     corners_0, middle_0, like_0 = address_of(corners), address_of(middle), address_of(like)
     texels_0, scratch_0 = address_of(texels), address_of(scratch)
+    quarter = np.float32(0.25)
     step, n_cells = 4 * width, max(size - 1, 1)
     right, below = step * min(size - 1, 1), step * size * min(size - 1, 1)
     n = 0
@@ -91,20 +92,20 @@ def _patches_of(i, begin, resolution, first, widths, texels, size, first_cell, n
         for y in range(n_cells):
             for x in range(n_cells):
                 own = corners_0 + step * (y * size + x)
+                for q in range(0, step, 16):
+                    total = scale_add(load_color(own + q), quarter, black())
+                    total = scale_add(load_color(own + right + q), quarter, total)
+                    total = scale_add(load_color(own + below + q), quarter, total)
+                    store_color(middle_0 + q, scale_add(load_color(own + below + right + q), quarter, total))
                 found = -1
-                for back in range(min(n, _MOST_LOOKED_AT)):
-                    other = n - 1 - back
-                    at = like_0 + step * (other % _MOST_LOOKED_AT)
-                    if _is_like(own, right, below, at, width, scratch_0, scratch, apart):
-                        found = other
-                        break
-                if found < 0:
-                    for q in range(0, step, 16):
-                        total = color_sum(load_color(own + q), load_color(own + right + q))
-                        total = color_sum(total, load_color(own + below + q))
-                        total = color_sum(total, load_color(own + below + right + q))
-                        store_color(middle_0 + q, scale_add(total, np.float32(0.25), black()))
-                    if _is_like(own, right, below, middle_0, width, scratch_0, scratch, apart):
+                if _is_even(own, right, below, middle_0, width, scratch_0, scratch, apart):
+                    back = 1
+                    while found < 0 and back <= min(n, _MOST_LOOKED_AT):
+                        at = like_0 + step * ((n - back) % _MOST_LOOKED_AT)
+                        if _apart(middle_0, at, width, scratch_0, scratch) <= apart:
+                            found = n - back
+                        back += 1
+                    if found < 0:
                         like[n % _MOST_LOOKED_AT] = middle
                         found = n
                         n += 1
@@ -113,14 +114,8 @@ def _patches_of(i, begin, resolution, first, widths, texels, size, first_cell, n
 
 
 @kernel
-def color_sum(a, b):  # type: ignore[no-untyped-def]
-    """``a + b``."""
-    return scale_add(a, np.float32(1.0), b)
-
-
-@kernel
-def _is_like(own, right, below, other, n, scratch_0, scratch, apart):  # type: ignore[no-untyped-def]
-    """Whether the four corners of a cell at an address are all within reach of what is at another."""
+def _is_even(own, right, below, other, n, scratch_0, scratch, apart):  # type: ignore[no-untyped-def]
+    """Whether the four corners of a cell at an address are all within reach of its middle."""
     return (
         _apart(own, other, n, scratch_0, scratch) <= apart
         and _apart(own + below + right, other, n, scratch_0, scratch) <= apart

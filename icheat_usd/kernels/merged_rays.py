@@ -195,13 +195,13 @@ def _take_together(  # type: ignore[no-untyped-def]
     width, n_rays, n_blocks, n_instances = weights.shape[1], rays.cell.shape[1], sent.shape[1], len(selected)
     room = n_rays * (end - first)
     ray_weight = np.empty((room_of_weights(n_rays), 4), np.float32)
-    sums, bright = np.empty((room, n_blocks, 5, 4), np.float32), np.empty(room, np.float32)
+    bright = np.empty(room, np.float32)
     # Instances, and behind these patches, and what is kept of each.
     n_places = 4
     while n_places < 2 * min(room, n_instances + patches.number):
         n_places *= 2
     key, kept = np.full(n_places, -1, np.int64), np.empty(n_places, np.int64)
-    sums_0, sent_0, texels_0 = address_of(sums), address_of(sent), address_of(sheets.texels)
+    light_0, sent_0, texels_0 = address_of(light), address_of(sent), address_of(sheets.texels)
     mean_0, weight_0, throughput_0 = address_of(weights), address_of(ray_weight), address_of(rays.throughput)
     cell, instance, triangle, uv, throughput = rays.cell, rays.instance, rays.triangle, rays.uv, rays.throughput
     detour, end_instance, end_face, end_face_uv = rays.detour, rays.end_instance, rays.end_face, rays.end_face_uv
@@ -253,7 +253,7 @@ def _take_together(  # type: ignore[no-untyped-def]
                 if place < 0 or key[place] < 0:
                     last = n
                     caster[n], bright[n] = i, np.float32(0.0)
-                    _blacken(sums_0 + 80 * n_blocks * n, 5 * n_blocks)
+                    _blacken(light_0 + 16 * N_VALUES * n_blocks * n, N_VALUES * n_blocks)
                     _blacken(mean_0 + 4 * width * n, width // 4)
                     n += 1
                     if place >= 0:
@@ -281,16 +281,16 @@ def _take_together(  # type: ignore[no-untyped-def]
                 brought = load_color(sent_0 + 16 * (sender * n_blocks + block))
                 if is_adjusted:
                     brought = color_product(brought, load_rgb(throughput_0 + 12 * (a - 1)))
-                add_weighted(sums_0 + 80 * (last * n_blocks + block), brought, share, weight_0, ray)
+                add_weighted(light_0 + 16 * N_VALUES * (last * n_blocks + block), brought, share, weight_0, ray)
     # All of a record stand at one place.
-    r, light_0 = order[first], address_of(light)
+    r = order[first]
     x, y, z, bx, by, bz = basis(rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2])
     for e in range(n):
         if bright[e] > np.float32(0.0):
             for c in range(width):
                 weights[e, c] /= bright[e]
     for q in range(n * n_blocks):
-        turn_to_world(sums_0 + 80 * q, (x, y, z), (bx, by, bz), light_0 + 16 * N_VALUES * q)
+        turn_to_world(light_0 + 16 * N_VALUES * q, (x, y, z), (bx, by, bz))
     return n, n_seen
 
 

@@ -53,7 +53,7 @@ def painted_sums(  # type: ignore[no-untyped-def]
         Painted masks on each caster, no more than `MOST_PAINTED`, and nothing else.
     least : int
         1 to leave out the light itself, which no edit asks for that is painted.
-    out : (n_sums, n_blocks, N_VALUES, 4) float32, out
+    out : (n_sums, n_blocks, N_VALUES, 4) float32, out, zero before
     """
     for r in prange(len(begin) - 1):
         if begin[r] < begin[r + 1]:
@@ -104,8 +104,8 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
     n_rays, n_blocks = cell.shape[1], sent.shape[1]
     weights = np.empty((room_of_weights(n_rays), 4), np.float32)
     ray_weights(rays.distance, r, first_turn, n_theta, n_phi, factor, weights)
-    sums = np.zeros((first[end] - first[begin], n_blocks, 5, 4), np.float32)
-    sums_0, sent_0, throughput_0 = address_of(sums), address_of(sent), address_of(rays.throughput)
+    sent_0, throughput_0 = address_of(sent), address_of(rays.throughput)
+    out_0 = address_of(out) + 16 * N_VALUES * n_blocks * first[begin]
     weights_0 = address_of(weights)
     share = np.float32(np.pi / n_rays * factor)
     adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
@@ -153,12 +153,11 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
                 light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
             for subset in range(least, n):
                 if product[subset] != np.float32(0.0):
-                    to = sums_0 + 80 * ((base + subset) * n_blocks + block)
+                    to = out_0 + 16 * N_VALUES * ((base + subset) * n_blocks + block)
                     add_weighted(to, scaled(light, product[subset]), share, weights_0, ray)
     x, y, z, bx, by, bz = basis(rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2])
-    out_0 = address_of(out) + 16 * N_VALUES * n_blocks * first[begin]
-    for q in range(len(sums) * n_blocks):
-        turn_to_world(sums_0 + 80 * q, (x, y, z), (bx, by, bz), out_0 + 16 * N_VALUES * q)
+    for q in range((first[end] - first[begin]) * n_blocks):
+        turn_to_world(out_0 + 16 * N_VALUES * q, (x, y, z), (bx, by, bz))
 
 
 @parallel_kernel

@@ -227,6 +227,29 @@ def test_rays_taken_together_bring_the_light_of_the_rays(edits, exactly, toleran
     np.testing.assert_allclose(fast, slow, rtol=tolerance, atol=1e-6)
 
 
+def test_light_that_there_is_no_room_for_is_found_again(monkeypatch):
+    """Rays under rough masks are kept apart: what they bring is many times what their records hold."""
+    whole = rendered(*MANY, is_kept=True)
+    changed = replace(MANY[0], amount=0.4), *MANY[1:]
+    again = whole.replay.edited(previews()[0].field(*changed))
+    room = 1 << 18
+    monkeypatch.setattr(merged_light, "MOST_BYTES", room)
+    monkeypatch.setattr(merged_light, "_MOST_OF_TABLE", room // 4)
+    monkeypatch.setattr(merged_light, "_PILOT", 1 << 12)
+    kept, tables = [], merged_light.MergedLight.tables
+
+    def watched(self, of, *others):
+        yield from tables(self, of, *others)
+        kept.append(sum(one.n_bytes for one in of.merged))
+
+    monkeypatch.setattr(merged_light.MergedLight, "tables", watched)
+    bounded = rendered(*MANY, is_kept=True)
+    np.testing.assert_array_equal(bounded.indirect_edited, whole.indirect_edited)
+    np.testing.assert_array_equal(bounded.replay.edited(previews()[0].field(*changed)), again)
+    assert (again != whole.indirect_edited).any()
+    assert room / 4 < max(kept) <= room
+
+
 def overlapping_brushes(n: int) -> tuple[Edit, ...]:
     """From soft places on a side wall to soft places on the back wall, all over each other."""
     edits = []
