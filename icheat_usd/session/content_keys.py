@@ -89,7 +89,8 @@ def snapshot_key(snapshot: SceneSnapshot, engine: str) -> str:
 def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     """All settings but those that other keys hold, or that come after the transport."""
     elsewhere = {"n_gather", "rays_per_bounce_row", "light_samples", "dome_samples", "n_bounces", "samples_per_pixel"}
-    unused = {"record_rays"} if quality.record_error is None else {"rays_per_row", "row_spacing", "shared_rays"}
+    at_records, everywhere = {"record_rays", "record_share"}, {"rays_per_row", "row_spacing", "shared_rays"}
+    unused = at_records if quality.record_error is None else everywhere
     without = elsewhere | unused | {"packing_error"}
     return tuple((name, value) for name, value in asdict(quality).items() if name not in without)
 

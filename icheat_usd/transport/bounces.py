@@ -14,9 +14,10 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, cell_direct
 from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
-from icheat_usd.transport.rays import RowBuilder
+from icheat_usd.transport.rays import MeasuredRows, RowBuilder
 from icheat_usd.transport.sparse import SparseRows
 
+_FEW_RAYS = 128  # of a row, that light on the move is content with: its time goes by the entries
 _CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
 
 
@@ -26,6 +27,7 @@ class Bounces:
 
     rows: SparseRows  #: (n_gather x n_gather) form factors without albedo; row sums at most 1
     albedo: F32  #: (n_gather, 3) mean reflectance of the cells
+    few: SparseRows  #: rows of some of the rays alone; `rows` themselves where these are few
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +72,17 @@ def build_bounces(
     Rays start from the patch points, so that a row is the mean over its cell.
     """
     builder = RowBuilder(snapshot, tracer, gather, seed)
-    rows = builder.measure(
-        gather.patch_points,
-        gather.cell_begin,
-        gather.number,
-        rays_per_row,
-        1,
-        progress,
-        "bounce rays",
-    )
+
+    def measure(n_rays: int, purpose: int) -> MeasuredRows:
+        points = gather.patch_points, gather.cell_begin, gather.number
+        return builder.measure(*points, n_rays, purpose, progress, "bounce rays")
+
+    few = measure(min(rays_per_row, _FEW_RAYS), 1)
+    # A sequence of their own, since either is spread over all points of a cell.
+    rows = few.continued(measure(rays_per_row - few.n_rays, 3)) if rays_per_row > few.n_rays else few
     albedo = np.empty((gather.n, 3), np.float32)
     row_kernels.mean_over_segments(gather.cell_begin, effective_albedo(gather.patch_points), albedo)
-    return Bounces(rows.cells, albedo)
+    return Bounces(rows.cells, albedo, few.cells)
 
 
 def solve_bounces(bounces: Bounces, direct: F32, n_bounces: int) -> F32:

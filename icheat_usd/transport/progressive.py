@@ -26,6 +26,8 @@ from icheat_usd.transport.sparse import SparseRows, concatenate_rows, take_rows
 _PLACING_RAYS = 128
 #: The same for every view sample, when outliers are looked for.
 _SURVEY_RAYS = 64
+#: Numbers of the survey that are held in memory, though it has some lights at least.
+_SURVEYED_NUMBERS, _FEWEST_LIGHTS = 1 << 26, 48
 _STRONG = 0.2  # reflectance: what reflects less gets no records of its own for that
 _SURVEYED_AT_ONCE = 1 << 15  # samples, whose rows are held in memory
 _FIRST_RAYS = 256  # of each record by itself, by which the others are allotted
@@ -119,15 +121,18 @@ def build_transports(
 
         return list(pieces.both(np.arange(len(samples)), int(counts.mean()) + 1 if len(counts) else 1, make))
 
+    n_surveyed = max(_FEWEST_LIGHTS, _SURVEYED_NUMBERS // (2 * view.n))
+    survey_lights = np.ascontiguousarray(lights[:, :n_surveyed])
+
     def look(samples: I64) -> F32:
         """Diffuse light by few rays, in two halves: (n, 2, n_lights)."""
         stream, half = np.zeros_like(samples), _SURVEY_RAYS // 2
-        parts = [trace(samples, stream, first, half, _SURVEY_RAYS).cells.matmul(lights) for first in (0, half)]
+        parts = [trace(samples, stream, first, half, _SURVEY_RAYS).cells.matmul(survey_lights) for first in (0, half)]
         return np.stack(parts, axis=1)
 
     def look_specular(samples: I64) -> F32:
         both = trace_specular(samples, np.zeros_like(samples), _glossy_counts(view, samples, _SURVEY_RAYS))
-        return np.stack([rows.matmul(lights) for rows in both], axis=1)
+        return np.stack([rows.matmul(survey_lights) for rows in both], axis=1)
 
     def survey() -> Survey:
         """The light at every view sample."""

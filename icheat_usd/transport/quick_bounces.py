@@ -30,7 +30,7 @@ _FAR = 0.1  # of all cells, if it was by more than this
 
 @dataclass(frozen=True, eq=False)
 class QuickBounces:
-    """Bounce rows in a word per entry, and the mean rows of clusters of neighbouring cells.
+    """Bounce rows of few rays in a word per entry, and the mean rows of clusters of neighbouring cells.
 
     Light `g` after all bounces balances ``g = d + A R g`` (d direct light, A albedo, R rows). A step adds what
     is missing, ``r = d + A R g - g`` with the exact rows, and what becomes of `r` in further bounces between
@@ -133,7 +133,7 @@ def build_quick_bounces(
     n_bounces : int
         Diffuse reflections before the last one, as for `solve_bounces`; at least 2.
     """
-    rows = bounces.rows
+    rows = bounces.few
     bits = max(1, int(tree.n_leaves - 1).bit_length())
     entries = np.empty(rows.n_entries, np.uint32)
     kernels.shorten(rows.indices, rows.weights, bits, entries)

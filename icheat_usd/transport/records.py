@@ -40,7 +40,7 @@ class RecordSettings:
     """
 
     tolerance: float = 0.01  #: relative RMS error of the image that interpolation may add
-    max_share: float = 0.14  #: of the view samples: there are no more records, where there is a choice
+    max_share: float = 0.2  #: of the view samples: there are no more records, where there is a choice
     coarsest: int = 32  #: pixels, a power of two: side of the largest blocks
 
     def __post_init__(self) -> None:

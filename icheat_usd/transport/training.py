@@ -62,7 +62,7 @@ class _Shape:
 
 
 def training_radiance(
-    snapshot: SceneSnapshot, tracer: Tracer, gather: GatherSamples, bounces: Bounces, n: int = 48, seed: int = 0
+    snapshot: SceneSnapshot, tracer: Tracer, gather: GatherSamples, bounces: Bounces, n: int = 96, seed: int = 0
 ) -> F32:
     """What `n` plausible lights make leave the gather cells, after some bounces.
 

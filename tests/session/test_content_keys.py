@@ -101,6 +101,7 @@ def test_geometry_materials_and_the_tracer_are_in_every_key_but_the_lights() -> 
         ("row_spacing", 4, {"transport", "packed"}),
         ("record_error", 0.1, {"transport", "packed"}),
         ("record_rays", 64, set()),  # without records
+        ("record_share", 0.5, set()),
         ("packing_error", 0.1, {"packed"}),
         ("n_bounces", 2, {"cell_light"}),
         ("rays_per_bounce_row", 16, {"bounces", "cell_light", "training", "packed"}),

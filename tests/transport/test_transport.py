@@ -57,6 +57,20 @@ def test_every_ray_in_a_closed_room_lands_in_a_cell() -> None:
     assert len(transport.lobes) == 1
 
 
+def test_light_on_the_move_has_the_first_rays_of_the_bounces_and_the_others_are_closer_to_the_truth() -> None:
+    scene = cornell(8, 8)
+    tracer, _, gather = prepare(scene, 400)
+    few, more = (build_bounces(scene, tracer, gather, rays_per_row=n) for n in (128, 512))
+    true = build_bounces(scene, tracer, gather, rays_per_row=4096, seed=1).rows.matmul(
+        np.eye(gather.n, dtype=np.float32)
+    )
+    dense, of_few = (rows.matmul(np.eye(gather.n, dtype=np.float32)) for rows in (more.rows, more.few))
+    np.testing.assert_array_equal(of_few, few.rows.matmul(np.eye(gather.n, dtype=np.float32)))
+    assert few.few is few.rows
+    # Four times the rays: half the noise.
+    assert np.linalg.norm(dense - true) < 0.6 * np.linalg.norm(of_few - true)
+
+
 def test_parallel_unit_squares_one_apart_see_a_fifth_of_each_other() -> None:
     lower, upper = Mesh(quad(1)), Mesh(quad(1), transforms=[translation(0, 1, 0) @ rotation((1, 0, 0), 180)])
     scene = make_snapshot([lower, upper], camera=look_at((0, 0.5, 2.5)))
