@@ -24,6 +24,7 @@ from icheat_usd.final_gather.light_parts import light_of_records
 from icheat_usd.final_gather.receiver_sets import MOST_SOFT, Touched, soft_masks, touched
 from icheat_usd.final_gather.row_records import RowRecords
 from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.record_mixtures import lay_change
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
 
@@ -161,21 +162,21 @@ def under_stack(
     if len(rest):
         some = receivers if len(rest) == len(where) else receivers.take(rest)
         at = some.where
-        change = np.empty((len(rest), 3), np.float32)
         near, lost = np.flatnonzero(has_records[rest]), np.flatnonzero(~has_records[rest])
         if len(near):
             reached = some if len(near) == len(rest) else some.take(near)
-            change[near] = records.change(sampled.found, points, reached)
+            change = records.change(sampled.found, points, reached)
+            lay_change(base, points.albedo, at[near], change, rest[near], light)
         if len(lost):
             assert sampled.own_rays is not None
             rows = np.searchsorted(sampled.alone, at[lost])
-            change[lost] = records.change_alone(points, sampled.own_rays, rows, some.take(lost))
-        albedo = np.take(points.albedo, at, axis=0)
-        light[rest] = np.take(base, at, axis=0) + albedo * (change * _INVERSE_PI)
+            change = records.change_alone(points, sampled.own_rays, rows, some.take(lost))
+            lay_change(base, points.albedo, at[lost], change, rest[lost], light)
         if shiny is not None:
             reflected = light_of_pairs(g, some.ends(), at, lobes, points.albedo, with_offsets=False)
             light[rest] += reflected - _brought(len(base), lobes)[at]
         if g.solution is not None and g.solution.offsets is not None:
+            albedo = np.take(points.albedo, at, axis=0)
             light[rest] += offset_radiance(g.field, g.solution.offsets, some.ends(), albedo)
     edited[where] = g.field.seen(light, receivers.view_lines(), is_part=g.is_part)
     return edited

@@ -21,7 +21,7 @@ from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup
 from icheat_usd.final_gather.merged_light import merged_light, painted_weights, sent_by_group
 from icheat_usd.final_gather.painted_light import bits, is_painted, light_by_masks, with_few
 from icheat_usd.final_gather.receiver_sets import Touched
-from icheat_usd.final_gather.slot_choices import Slots, slot_choices
+from icheat_usd.final_gather.slot_choices import Slots, in_turn, slot_choices
 from icheat_usd.kernels import painted_sums, stack_sums
 from icheat_usd.kernels import record_slots as kernels
 from icheat_usd.kernels.mask_table import MaskTable
@@ -146,7 +146,7 @@ class MaskedRecords:
                 self._casters,
                 self._stack,
                 slots,
-                np.flatnonzero(wanted),
+                in_turn(np.flatnonzero(wanted)),
                 values,
                 derivative,
             )
@@ -162,7 +162,7 @@ class MaskedRecords:
                     self._casters.weight,
                     self._stack,
                     slots,
-                    np.flatnonzero(wanted & table.has),
+                    in_turn(np.flatnonzero(wanted & table.has)),
                     values,
                     derivative,
                 )

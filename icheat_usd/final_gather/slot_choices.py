@@ -25,6 +25,7 @@ from icheat_usd.scene import F32, I32, I64, Bool
 MOST_CHANGE, MOST_BEND = 0.25, 0.01
 #: Stacks whose choices are kept for others.
 _MOST_KEPT = 4
+_TURNS = 64  #: more than there are threads
 
 
 class Slots(NamedTuple):
@@ -34,6 +35,7 @@ class Slots(NamedTuple):
     masks: F32  #: (n, n_rows)
     pattern: I32  #: (n,)
     derived: I64  #: (n + 1,) derivatives of each
+    is_own: Bool  #: (n,) whether the masks are those of the record's own place
 
 
 class _Step(NamedTuple):
@@ -76,7 +78,11 @@ class SlotChoices:
         self._before: list[_Step] = []
         n_rows = field.n_rows
         self.slots = Slots(
-            np.empty(0, np.int64), np.empty((0, n_rows), np.float32), np.empty(0, np.int32), np.zeros(1, np.int64)
+            np.empty(0, np.int64),
+            np.empty((0, n_rows), np.float32),
+            np.empty(0, np.int32),
+            np.zeros(1, np.int64),
+            np.empty(0, np.bool_),
         )
 
     def is_of(self, field: EditField, bend: F32) -> bool:
@@ -109,50 +115,74 @@ class SlotChoices:
             return self._before[step].slot
         self._before = []
         if self._bend.any():
-            slot = self._choose(found, receivers.where, receivers.which, masks)
+            slot = self._choose(found, receivers.where, receivers.which, masks, first)
         else:
             slot = self._choose_by_pattern(found, receivers.where, receivers.which, masks, first)
         if self._of.is_kept:
             self._steps.append(_Step(found, receivers, self.slots, slot))
         return slot
 
-    def _choose(self, found: Lookup, where: I64, which: I64, masks: F32) -> I64:
+    def _choose(self, found: Lookup, where: I64, which: I64, masks: F32, first: I64) -> I64:
         """`serve` where masks vary from place to place."""
-        slots, n_records = self.slots, self._of.n
-        pattern = self.patterns.of(masks)
+        slots, n_records, pattern = self.slots, self._of.n, self.patterns.of(masks)
         own_masks, own_pattern = self._own_masks()
-        n_pairs = int(np.take(found.number, where).sum())
-        begin = np.empty(n_records + 1, np.int64)
-        pair, place = np.empty(n_pairs, np.int64), np.empty(n_pairs, np.int64)
-        kernels.list_pairs(found.number, found.record, where, begin, pair, place)
-        known = np.argsort(slots.record, kind="stable")
-        known_begin = np.searchsorted(slots.record[known], np.arange(n_records + 1))
-        centre, is_own = np.empty(n_pairs, np.int64), np.empty(n_pairs, np.uint8)
-        kernels.choose_slots(
-            begin,
-            place,
+        near = (self._bend, MOST_CHANGE, MOST_BEND)
+        slot = np.empty(int(np.take(found.number, where).sum()), np.int64)
+        used = np.zeros(n_records, np.uint8)
+        kernels.served_by_own(
+            found.number,
+            found.record,
+            where,
             which,
             masks,
             pattern,
             own_masks,
             own_pattern,
-            known_begin,
+            *near,
+            first,
+            slot,
+            used,
+        )
+        own_slot = np.full(n_records, -1, np.int64)
+        own_slot[slots.record[slots.is_own]] = np.flatnonzero(slots.is_own)
+        own = np.flatnonzero(used.view(np.bool_) & (own_slot < 0))
+        # The few others, by record.
+        pair = np.flatnonzero(slot == -2)
+        place = np.searchsorted(first, pair, side="right") - 1
+        record = found.record[where[place], pair - first[place]].astype(np.int64)
+        order = np.argsort(record, kind="stable")
+        pair, record, column = pair[order], record[order], which[place[order]]
+        numbers = np.arange(n_records + 1)
+        known, centre = np.argsort(slots.record, kind="stable"), np.empty(len(pair), np.int64)
+        kernels.choose_slots(
+            in_turn(np.unique(record)),
+            np.searchsorted(record, numbers),
+            column,
+            masks,
+            pattern,
+            np.searchsorted(slots.record[known], numbers),
             known,
             slots.masks,
             slots.pattern,
-            self._bend,
-            MOST_CHANGE,
-            MOST_BEND,
+            *near,
             centre,
-            is_own,
         )
-        chosen, slot = np.empty(n_pairs, np.int64), np.empty(n_pairs, np.int64)
-        n_new = kernels.number_slots(centre, pair, len(slots.record), chosen, slot)
-        new = chosen[:n_new]
-        if n_new:
-            record = np.searchsorted(begin, new, side="right") - 1
-            column = which[place[new]]
-            self._add(record, np.where(is_own[new, None], own_masks[record], masks[column]), pattern[column])
+        new = np.flatnonzero(centre == np.arange(len(pair)))
+        of_new = np.concatenate([own, record[new]])
+        order = np.argsort(of_new, kind="stable")
+        number = np.empty(len(of_new), np.int64)
+        number[order] = len(slots.record) + np.arange(len(of_new))
+        own_slot[own] = number[: len(own)]
+        of_pair = np.zeros(len(pair), np.int64)
+        of_pair[new] = number[len(own) :]
+        slot[pair] = np.where(centre < 0, -1 - centre, of_pair[np.maximum(centre, 0)])
+        kernels.take_own(found.number, found.record, where, own_slot, first, slot)
+        self._add(
+            of_new[order],
+            np.concatenate([own_masks[own], masks[column[new]]])[order],
+            np.concatenate([own_pattern[own], pattern[column[new]]])[order],
+            order < len(own),
+        )
         return slot
 
     def _choose_by_pattern(self, found: Lookup, where: I64, which: I64, masks: F32, first: I64) -> I64:
@@ -170,7 +200,7 @@ class SlotChoices:
             known[record, new] = len(self.slots.record) + np.arange(len(record))
             column = np.zeros(needed.shape[1], np.int64)
             column[pattern] = np.arange(len(pattern))
-            self._add(record, masks[column[new]], new.astype(np.int32))
+            self._add(record, masks[column[new]], new.astype(np.int32), np.zeros(len(record), np.bool_))
         slot = np.empty(int(found.number[where].sum()), np.int64)
         kernels.slots_of_pairs(found.number, found.record, where, at_places, known, first, slot)
         return slot
@@ -193,8 +223,10 @@ class SlotChoices:
             self._own = masks, self.patterns.of(masks)
         return self._own
 
-    def _add(self, record: I64, masks: F32, pattern: I32) -> None:
+    def _add(self, record: I64, masks: F32, pattern: I32, is_own: Bool) -> None:
         """New slots, of ascending records."""
+        if len(record) == 0:
+            return
         number = (self.patterns.places() >= 0).sum(axis=1)[pattern]
         old = self.slots
         self.slots = Slots(
@@ -202,6 +234,7 @@ class SlotChoices:
             np.concatenate([old.masks, masks]),
             np.concatenate([old.pattern, pattern]),
             np.concatenate([old.derived, old.derived[-1] + np.cumsum(number, dtype=np.int64)]),
+            np.concatenate([old.is_own, is_own]),
         )
 
 
@@ -214,6 +247,11 @@ def _is_same(step: _Step, found: Lookup, receivers: Touched) -> bool:
         and np.array_equal(own.where, receivers.where)
         and np.array_equal(own.which, receivers.which)
     )
+
+
+def in_turn(records: I64) -> I64:
+    """Numbers in an order of which any long part has some from everywhere, so that threads have as much to do."""
+    return records[np.argsort(np.arange(len(records)) % _TURNS, kind="stable")]
 
 
 class Patterns:

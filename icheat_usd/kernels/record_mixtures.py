@@ -7,6 +7,8 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 
+_INVERSE_PI = np.float32(1.0 / np.pi)
+
 
 @kernel
 def mark_records(count, record, where, which, begin, entry, needed):  # type: ignore[no-untyped-def]
@@ -31,6 +33,25 @@ def mark_records(count, record, where, which, begin, entry, needed):  # type: ig
             one = entry[e]
             for k in range(count[p]):
                 needed[one, record[p, k]] = 1
+
+
+@parallel_kernel
+def lay_change(base, albedo, where, change, number, light):  # type: ignore[no-untyped-def]
+    """Light of m of n places with a change of their irradiance.
+
+    Parameters
+    ----------
+    base, albedo : (n, 3) float32
+        Radiance without the change.
+    where : (m,) int64, change : (m, 3) float32
+    number : (m,) int64
+        Rows of `light` that they go to.
+    light : (k, 3) float32, out
+    """
+    for q in prange(len(where)):
+        p, to = where[q], number[q]
+        for c in range(3):
+            light[to, c] = base[p, c] + albedo[p, c] * (change[q, c] * _INVERSE_PI)
 
 
 @parallel_kernel

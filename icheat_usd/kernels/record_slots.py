@@ -114,14 +114,108 @@ def _difference(a, i, b, j, bend, sums):  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def choose_slots(  # type: ignore[no-untyped-def]
-    begin,
-    place,
+def served_by_own(  # type: ignore[no-untyped-def]
+    count,
+    record,
+    where,
     which,
     masks,
     pattern,
     own_masks,
     own_pattern,
+    bend,
+    most_change,
+    most_bend,
+    first,
+    slot,
+    is_used,
+):
+    """Which pairs of a place and a record are served by a slot with the masks of the record's own place.
+
+    Parameters
+    ----------
+    count, record, where : as of `list_pairs`
+    which : (m,) int64
+        Column of masks of each place.
+    masks : (k, n_rows) float32, pattern : (k,) int32
+        Columns; those of different patterns never share a slot.
+    own_masks : (n_records, n_rows) float32, own_pattern : (n_records,) int32
+        Of the records' own places.
+    bend : (n_rows,) float32
+        Largest relative change of light by each row, 0 where masks do not vary within a pattern.
+    most_change, most_bend : float
+        Limits of the relative change between a place and its slot, and of what it misses of it.
+    first : (m,) int64
+        First pair of each place.
+    slot : (n_pairs,) int64, out
+        -1 for pairs that are, -2 for those that are not.
+    is_used : (n_records,) uint8, out
+        Set to 1 for records that a pair is served by.
+    """
+    for q in prange(len(where)):
+        _serve(
+            where[q],
+            which[q],
+            first[q],
+            count,
+            record,
+            masks,
+            pattern,
+            own_masks,
+            own_pattern,
+            bend,
+            most_change,
+            most_bend,
+            slot,
+            is_used,
+        )
+
+
+@kernel
+def _serve(  # type: ignore[no-untyped-def]
+    p,
+    column,
+    first,
+    count,
+    record,
+    masks,
+    pattern,
+    own_masks,
+    own_pattern,
+    bend,
+    most_change,
+    most_bend,
+    slot,
+    is_used,
+):
+    sums = np.empty(8, np.float32)
+    for k in range(count[p]):
+        r = record[p, k]
+        slot[first + k] = -2
+        if own_pattern[r] == pattern[column]:
+            change, bent = _difference(masks, column, own_masks, r, bend, sums)
+            if change <= most_change and bent <= most_bend:
+                slot[first + k] = -1
+                is_used[r] = 1
+
+
+@parallel_kernel
+def take_own(count, record, where, own_slot, first, slot):  # type: ignore[no-untyped-def]
+    """Put the slots of the records' own places, (n_records,), where `served_by_own` left -1."""
+    for q in prange(len(where)):
+        p = where[q]
+        for k in range(count[p]):
+            if slot[first[q] + k] == -1:
+                slot[first[q] + k] = own_slot[record[p, k]]
+
+
+@parallel_kernel
+def choose_slots(  # type: ignore[no-untyped-def]
+    records,
+    begin,
+    which,
+    masks,
+    pattern,
     known_begin,
     known_slot,
     slot_masks,
@@ -130,64 +224,49 @@ def choose_slots(  # type: ignore[no-untyped-def]
     most_change,
     most_bend,
     centre,
-    is_own,
 ):
     """Slots that pairs of places and records are served by.
 
     Parameters
     ----------
-    begin, place : as of `list_pairs`
-    which : (m,) int64
-        Column of masks of each place.
-    masks : (k, n_rows) float32, pattern : (k,) int32
-        Columns; those of different patterns never share a slot.
-    own_masks : (n_records, n_rows) float32, own_pattern : (n_records,) int32
-        Of the records' own places, which make the first slot where they serve.
+    records : (k,) int64
+        Those with pairs, in any order.
+    begin : (n_records + 1,) int64
+        Pairs of each record.
+    which : (n_pairs,) int64
+        Column of masks of each.
+    masks, pattern, bend, most_change, most_bend : as of `served_by_own`
     known_begin : (n_records + 1,) int64, known_slot : (n_slots,) int64
         Slots that there are already, by record.
     slot_masks : (n_slots, n_rows) float32, slot_pattern : (n_slots,) int32
-    bend : (n_rows,) float32
-        Largest relative change of light by each row, 0 where masks do not vary within a pattern.
-    most_change, most_bend : float
-        Limits of the relative change between a place and its slot, and of what it misses of it.
     centre : (n_pairs,) int64, out
         Pair whose slot serves each, itself where it gets a new one; ``-1 - s`` for a known slot s.
-    is_own : (n_pairs,) uint8, out
-        1 where a new slot has the masks of the record's own place, not those of the pair's.
     """
-    for r in prange(len(begin) - 1):
-        if begin[r] < begin[r + 1]:
-            _choose(
-                r,
-                begin,
-                place,
-                which,
-                masks,
-                pattern,
-                own_masks,
-                own_pattern,
-                known_begin,
-                known_slot,
-                slot_masks,
-                slot_pattern,
-                bend,
-                most_change,
-                most_bend,
-                centre,
-                is_own,
-            )
+    for g in prange(len(records)):
+        _choose(
+            records[g],
+            begin,
+            which,
+            masks,
+            pattern,
+            known_begin,
+            known_slot,
+            slot_masks,
+            slot_pattern,
+            bend,
+            most_change,
+            most_bend,
+            centre,
+        )
 
 
 @kernel
 def _choose(  # type: ignore[no-untyped-def]
     r,
     begin,
-    place,
     which,
     masks,
     pattern,
-    own_masks,
-    own_pattern,
     known_begin,
     known_slot,
     slot_masks,
@@ -196,13 +275,11 @@ def _choose(  # type: ignore[no-untyped-def]
     most_change,
     most_bend,
     centre,
-    is_own,
 ):
     new, n_new = np.empty(MOST_SLOTS, np.int64), 0
     sums = np.empty(8, np.float32)
     for e in range(begin[r], begin[r + 1]):
-        column = which[place[e]]
-        is_own[e] = 0
+        column = which[e]
         best, least = np.int64(e), np.float32(np.inf)
         is_near = False
         for k in range(known_begin[r], known_begin[r + 1]):
@@ -217,58 +294,20 @@ def _choose(  # type: ignore[no-untyped-def]
                     break
         q = 0
         while q < n_new and not is_near:
-            other = new[q]
+            there = which[new[q]]
             q += 1
-            if is_own[other]:
-                if own_pattern[r] != pattern[column]:
-                    continue
-                change, bent = _difference(masks, column, own_masks, r, bend, sums)
-            else:
-                there = which[place[other]]
-                if pattern[there] != pattern[column]:
-                    continue
-                change, bent = _difference(masks, column, masks, there, bend, sums)
+            if pattern[there] != pattern[column]:
+                continue
+            change, bent = _difference(masks, column, masks, there, bend, sums)
             if change < least:
-                best, least = other, change
+                best, least = new[q - 1], change
                 is_near = change <= most_change and bent <= most_bend
         if not is_near and (n_new < MOST_SLOTS or best == e):
             best = np.int64(e)
-            if own_pattern[r] == pattern[column]:
-                change, bent = _difference(masks, column, own_masks, r, bend, sums)
-                if change <= most_change and bent <= most_bend:
-                    is_own[e] = 1
             if n_new < MOST_SLOTS:
                 new[n_new] = e
                 n_new += 1
         centre[e] = best
-
-
-@kernel
-def number_slots(centre, pair, known, new, slot):  # type: ignore[no-untyped-def]
-    """Numbers of the slots that `choose_slots` chose; how many of them are new.
-
-    Parameters
-    ----------
-    centre : (n_pairs,) int64, as of `choose_slots`
-    pair : (n_pairs,) int64, as of `list_pairs`
-    known : int
-        How many slots there are already.
-    new : (n_pairs,) int64, out
-        Pair that each new slot is of.
-    slot : (n_pairs,) int64, out
-        Slot of every pair in the order of places.
-    """
-    n = 0
-    for e in range(len(centre)):
-        if centre[e] == e:
-            new[n] = e
-            n += 1
-            slot[pair[e]] = known + n - 1
-        elif centre[e] < 0:
-            slot[pair[e]] = -1 - centre[e]
-        else:
-            slot[pair[e]] = slot[pair[centre[e]]]
-    return n
 
 
 @parallel_kernel
