@@ -21,6 +21,7 @@ QUICK = ErrorSettings(
     sheet_rays=16,
     n_bounces=3,
     tolerances=(0.1, 0.02),
+    shares=(0.3,),
 )
 
 
@@ -38,7 +39,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     under = parts.under(with_lights(parts.snapshot, lights))
     settings = QUICK if quick else ErrorSettings()
     if fine:  # what does not depend on the mode is measured once
-        settings = replace(settings, hit_pixels=0, tolerances=())
+        settings = replace(settings, hit_pixels=0, tolerances=(), shares=())
     found = measure_errors(under, settings, folder / case.get("quality", "LIVE"))
     for light in lights:
         found["lights"][light.name]["what"] = light.note

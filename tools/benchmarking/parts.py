@@ -69,6 +69,13 @@ class Parts:
         other._shot = ShotParts(self.effort.settings(), snapshot=snapshot, memory=self._memory)
         return other
 
+    def with_quality(self, **changes: Any) -> Parts:
+        """The same with other settings of the quality; what these do not change is shared."""
+        other = self.under(self.snapshot)
+        other.effort = replace(self.effort, changes=(*self.effort.changes, *changes.items()))
+        other._shot = ShotParts(other.effort.settings(), snapshot=self.snapshot, memory=self._memory)
+        return other
+
     @property
     def tracer(self) -> Tracer:
         return self._shot.tracer

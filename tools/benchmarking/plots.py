@@ -27,23 +27,27 @@ def plot(report: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def _curve(results: list[dict[str, Any]], path: Path) -> bool:
-    """Error against speed, over tolerances of packing."""
+    """Error against the speed of a frame with everything in it, by each setting."""
     curves = {one["case"]["name"]: one["result"]["curve"] for one in results if one["result"].get("curve")}
     if not curves:
         return False
-    figure, axes = pyplot.subplots(figsize=(6, 4))
-    for name, points in curves.items():
-        axes.plot([p["fps"] for p in points], [100 * p["total"] for p in points], "o-", label=f"{name}, total")
-        axes.plot([p["fps"] for p in points], [100 * p["packing"] for p in points], "o--", label=f"{name}, packing")
-        for point in points:
-            place = (point["fps"], 100 * point["total"])
-            axes.annotate(f"{100 * point['tolerance']:g} %", place, (3, 4), textcoords="offset points", fontsize=6)
-    axes.set_title("by the error that packing may add", fontsize=9)
-    axes.set_xlabel("frames per second, light colour")
-    axes.set_ylabel("relative RMS error, %")
-    axes.set_yscale("log")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    figure, all_axes = pyplot.subplots(1, len(curves), figsize=(5.5 * len(curves), 4), squeeze=False)
+    for axes, (name, points) in zip(all_axes[0], curves.items(), strict=True):
+        for k, by in enumerate(dict.fromkeys(point["by"] for point in points)):
+            some = [point for point in points if point["by"] == by]
+            speed = [1 / point["whole_seconds"] for point in some]
+            for what, style in (("total_worst", "s:"), ("total", "o-"), ("packing", "o--")):
+                label = f"{what.replace('_', ', ')}, by {by}"
+                axes.plot(speed, [100 * point[what] for point in some], style, color=f"C{k}", label=label)
+            for x, point in zip(speed, some, strict=True):
+                place = (x, 100 * point["total"])
+                axes.annotate(f"{100 * point['setting']:g} %", place, (3, 4), textcoords="offset points", fontsize=6)
+        axes.set_title(f"{name}: median over the lights, and worst", fontsize=9)
+        axes.set_xlabel("frames per second, all products with two threads")
+        axes.set_ylabel("relative RMS error, %")
+        axes.set_yscale("log")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=6)
     _save(figure, path)
     return True
 
