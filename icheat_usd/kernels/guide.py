@@ -156,11 +156,44 @@ def find_keys(axis: I32, split: F32, child: I32, position: F32, normal: F32, out
 
 
 @parallel_kernel
+def plane_places(
+    lights: Table, textures: Table, tables: Table, light: int, seed: int, direction: F32, level: F32
+) -> None:
+    """Some places in each cell of a dome's plane.
+
+    Parameters
+    ----------
+    direction : (BANDS * COLUMNS, k, 3) float32, out
+        Towards the dome.
+    level : (BANDS * COLUMNS, k) float32, out
+        Radiance over the plain sampler's probability, relative to the light; 0 where it sends nothing.
+    """
+    kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
+    texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
+    for cell in prange(BANDS * COLUMNS):
+        for k in range(level.shape[1]):
+            word = hash_combine(hash_combine(hash_combine(seed, 0x13), light), cell * level.shape[1] + k)
+            v1 = (cell % COLUMNS + to_unit(hash_u32(word))) / COLUMNS
+            v2 = (cell // COLUMNS + to_unit(hash_u32(hash_u32(word)))) / BANDS
+            level[cell, k] = 0.0
+            if image[0] >= 0:
+                wx, wy, wz, t, pdf, red, green, blue = sample_shape(
+                    kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, v1, v2
+                )
+                if pdf > 0.0:
+                    level[cell, k] = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / pdf
+            else:
+                wx, wy, wz = sphere_direction(v1, v2)
+                level[cell, k] = 4.0 * math.pi
+            direction[cell, k, 0] = wx
+            direction[cell, k, 1] = wy
+            direction[cell, k, 2] = wz
+
+
+@parallel_kernel
 def fill_pilot(
-    lights: Table,
-    textures: Table,
-    tables: Table,
-    light: int,
+    towards: F32,
+    level: F32,
     begin: I64,
     first: int,
     position: F32,
@@ -173,29 +206,17 @@ def fill_pilot(
 ) -> None:
     """One ray per cell of the plane for each group of points `begin[i]:begin[i + 1]`, each from a point of the group.
 
-    `value` is the unshadowed contribution to irradiance, radiance times cosine over the plain sampler's
-    probability, relative to the light; 0 where the point's horizon hides the direction.
+    `towards` and `level` are of `plane_places`. `value` is the unshadowed contribution to irradiance, `level` times
+    cosine; 0 where the point's horizon hides the direction.
     """
-    kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
-    texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
     cells = BANDS * COLUMNS
     for i in prange(len(begin) - 1):
-        stream = hash_combine(hash_combine(hash_combine(seed, 0x13), light), first + i)
+        stream = hash_combine(hash_combine(seed, 0x17), first + i)
         for cell in range(cells):
             word = hash_combine(stream, cell)
             p = begin[i] + int(word) % (begin[i + 1] - begin[i])
-            v1 = (cell % COLUMNS + to_unit(hash_u32(word))) / COLUMNS
-            v2 = (cell // COLUMNS + to_unit(hash_u32(hash_u32(word)))) / BANDS
-            if image[0] >= 0:
-                wx, wy, wz, t, pdf, red, green, blue = sample_shape(
-                    kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, v1, v2
-                )
-                if pdf <= 0.0:
-                    continue
-                level = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / pdf
-            else:
-                wx, wy, wz = sphere_direction(v1, v2)
-                level = 4.0 * math.pi
+            k = int(hash_u32(word)) % level.shape[1]
+            wx, wy, wz = towards[cell, k, 0], towards[cell, k, 1], towards[cell, k, 2]
             cosine = wx * shading_normal[p, 0] + wy * shading_normal[p, 1] + wz * shading_normal[p, 2]
             if cosine <= 0.0 or wx * normal[p, 0] + wy * normal[p, 1] + wz * normal[p, 2] <= 0.0:
                 continue
@@ -204,7 +225,7 @@ def fill_pilot(
             direction[row, 0] = wx
             direction[row, 1] = wy
             direction[row, 2] = wz
-            value[row] = level * cosine
+            value[row] = level[cell, k] * cosine
 
 
 @parallel_kernel

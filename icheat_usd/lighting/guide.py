@@ -16,9 +16,11 @@ from icheat_usd.kernels.guide import (
     accumulate_planes,
     fill_pilot,
     find_keys,
+    plane_places,
     smooth_planes,
 )
 from icheat_usd.kernels.lights import LightTables
+from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting.controls import tracer_for
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, SurfacePoints
@@ -27,6 +29,7 @@ from icheat_usd.tracing import Tracer, spawn_points, transmittance
 _CELLS = BANDS * COLUMNS
 
 _POINTS = 1 << 15  # that vote for the leaves: more only make the tree slower to build
+_PLACES = 64  # in each cell of a plane, that its rays go to: looking up an image costs more than tracing
 _GROUPS_AT_ONCE = 64  # densities learnt together: an eighth of a million rays
 
 
@@ -122,10 +125,13 @@ def learn_guide(
     for light in domes.tolist():
         square = np.zeros((len(keys), _CELLS), np.float32)
         to_light = tracer_for(snapshot, tracer, light)
+        towards, level = np.empty((_CELLS, _PLACES, 3), np.float32), np.empty((_CELLS, _PLACES), np.float32)
+        plane_places(snapshot.lights, snapshot.textures, tables, light, seed & 0xFFFFFFFF, towards, level)
         for turn in range(effort.rays):
+            own_seed = int(hash_combine(hash_combine(seed, light), turn))
             for first in range(0, len(keys), _GROUPS_AT_ONCE):
                 part = begin[first : first + _GROUPS_AT_ONCE + 1]
-                found = _pilot(snapshot, to_light, tables, light, points, start, part, first, seed + turn)
+                found = _pilot(snapshot, to_light, towards, level, points, start, part, first, own_seed)
                 square[first : first + len(part) - 1] += found / np.float32(effort.rays)
                 yield
         weight, useful = _weights(square, keys, textured=bool(lights.texture[light] >= 0))
@@ -167,8 +173,8 @@ def _tree(position: F32, leaves: int) -> tuple[I32, F32, I32, int]:
 def _pilot(
     snapshot: SceneSnapshot,
     tracer: Tracer,
-    tables: LightTables,
-    light: int,
+    towards: F32,
+    level: F32,
     points: SurfacePoints,
     start: F32,
     begin: I64,
@@ -177,22 +183,20 @@ def _pilot(
 ) -> F32:
     """Squared contribution of each cell of the plane to some groups of points, (n_groups, cells).
 
-    `start` (n, 3) where rays from the points start; `begin` (n_groups + 1,) of the groups, the first of which has
-    the number `first`.
+    `towards` and `level` are of `plane_places`, `start` (n, 3) is where rays from the points start; `begin`
+    (n_groups + 1,) of the groups, the first of which has the number `first`.
     """
     n = (len(begin) - 1) * _CELLS
     point, direction, value = np.zeros(n, np.int64), np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
     fill_pilot(
-        snapshot.lights,
-        snapshot.textures,
-        tables,
-        light,
+        towards,
+        level,
         begin,
         first,
         points.position,
         points.normal,
         points.shading_normal,
-        seed & 0xFFFFFFFF,
+        seed,
         point,
         direction,
         value,
