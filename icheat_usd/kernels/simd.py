@@ -334,6 +334,12 @@ def color_add(builder: Any, values: Any) -> Any:
     return _call(builder, "llvm.fmuladd.v4f32", _F4X, *values)
 
 
+@_operation(floats, color)
+def four_times(builder: Any, values: Any) -> Any:
+    """A colour four times over."""
+    return _picked(builder, values[0], values[0], [0, 1, 2, 3] * 4)
+
+
 @_operation(floats, color, color, floats)
 def add_outer(builder: Any, values: Any) -> Any:
     """Four colours, each number of `a` times `b`, added to four others; rounded once where the machine can."""

@@ -21,9 +21,13 @@ from icheat_usd.kernels.simd import (
     color_of,
     color_product,
     difference,
+    four_times,
+    load,
     load_color,
+    multiply_add,
     scale_add,
     scaled,
+    store,
     store_color,
 )
 
@@ -245,9 +249,7 @@ def _of_casters(  # type: ignore[no-untyped-def]
                 start = load_color(start_0 + 16 * block)
                 change = _composed(own, shifts, is_last, base, n, weight, start, past_0, factor_0)
                 at = light_0 + 16 * N_VALUES * (e * light.shape[1] + block)
-                for v in range(N_VALUES):
-                    to = values_0 + 16 * (N_VALUES * s + v)
-                    store_color(to, color_add(change, load_color(at + 16 * v), load_color(to)))
+                _add_values(change, at, values_0 + 16 * N_VALUES * s)
                 if slots.derived[s] < slots.derived[s + 1]:
                     _derive(
                         line_0 + 32 * block,
@@ -266,8 +268,13 @@ def _of_casters(  # type: ignore[no-untyped-def]
                     )
                     for q in range(n):
                         if to_place[q] >= 0:
-                            slope = load_color(slope_0 + 16 * q)
                             own = derivative_0 + 16 * N_VALUES * (slots.derived[s] + to_place[q])
-                            for v in range(N_VALUES):
-                                to = own + 16 * v
-                                store_color(to, color_add(slope, load_color(at + 16 * v), load_color(to)))
+                            _add_values(load_color(slope_0 + 16 * q), at, own)
+
+
+@kernel
+def _add_values(factor, at, to):  # type: ignore[no-untyped-def]
+    """Add values (N_VALUES, 4) at an address, each times a colour, to others; four of them at once."""
+    store(to, multiply_add(four_times(factor), load(at), load(to)))
+    for v in range(4, N_VALUES):
+        store_color(to + 16 * v, color_add(factor, load_color(at + 16 * v), load_color(to + 16 * v)))
