@@ -49,8 +49,8 @@ class CacheSettings:
     most_turn: float = 20.0  #: degrees between normals
     tolerance: float = 0.1  #: relative error of a record's own prediction at another, from which it ends before that
     coverage: float = 0.5  #: sum of weights at a place, 1 at a record itself, from which it needs no record of its own
-    #: Paths from each patch that is nearer than cells resolve, 0 for none. They took 16 to 27 % more time; a room with
-    #: sun on its windows had twice the error without, plain boxes hardly more.
+    #: Paths from each patch that is nearer than cells resolve, 0 for none. They take up to a quarter more time where
+    #: light is uneven, and little elsewhere; a room with sun on its windows had twice the error without.
     near_paths: int = 4
 
     def __post_init__(self) -> None:

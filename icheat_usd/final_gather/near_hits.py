@@ -1,8 +1,9 @@
-"""Light of hits that are much nearer than a gather cell is wide, gathered where they are: a cell is too coarse there.
+"""Light of hits that are nearer than a gather cell is wide, gathered where they are: a cell is too coarse there.
 
 At contacts, in corners and in narrow gaps light changes within a cell, and most rays of a record end in a few of them.
-A path goes on from such a hit, with direct light at each of its vertices, until it ends further away from the vertex
-before than half a cell is wide (the secondary final gather for nearby surfaces of Jensen 1996, Global Illumination
+Where neighbouring cells send about the same light it does not, and the hits of such cells keep their light.
+A path goes on from any other, with direct light at each of its vertices, until it ends further away from the vertex
+before than a cell is wide (the secondary final gather for nearby surfaces of Jensen 1996, Global Illumination
 using Photon Maps, section 4). Paths are shared: a cell is divided into patches about as wide as the rays that end in
 them are long, and all rays that end in one get the mean of its first few paths.
 """
@@ -22,7 +23,11 @@ from icheat_usd.scene import F32, F64, I32, I64, U64, Bool, SceneSnapshot, Surfa
 from icheat_usd.tracing import Tracer
 
 #: A hit is near if its distance is less than this many widths of the cell that it lies in.
-WIDTHS = 0.5
+WIDTHS = 1.0
+
+#: Cells whose neighbours differ by less than this are taken as lit evenly.
+EVEN = 0.15
+_NEIGHBOURS = 8
 
 _VERTICES = 2  # of a path between near surfaces, at most
 
@@ -52,6 +57,7 @@ class NearLight:
 
     def __post_init__(self) -> None:
         widths = np.float32(WIDTHS) * np.sqrt(self.gather.area.astype(np.float32))
+        widths[_unevenness(self.cells) < EVEN] = 0
         self._reach = np.append(widths, np.float32(0))
 
     def is_near(self, distance: F32, cell: I32) -> Bool:
@@ -76,11 +82,10 @@ class NearLight:
         light = self._paths(points, stream).astype(np.float64)
         joined = np.concatenate([self._key, key])
         self._key, where = np.unique(joined, return_inverse=True)
-        total = np.zeros((len(self._key), 3))
-        number = np.zeros(len(self._key), np.int64)
-        np.add.at(total, where, np.concatenate([self._sum, light]))
-        np.add.at(number, where, np.concatenate([self._number, np.ones(len(key), np.int64)]))
-        self._sum, self._number = total, number
+        n, light = len(self._key), np.concatenate([self._sum, light])
+        self._sum = np.stack([np.bincount(where, light[:, channel], n) for channel in range(3)], axis=1)
+        number = np.concatenate([self._number, np.ones(len(key), np.int64)])
+        self._number = np.bincount(where, number, n).astype(np.int64)
 
     def radiance(self, key: U64) -> F32:
         """Radiance of hits in patches that are known, (n, 3)."""
@@ -109,3 +114,15 @@ class NearLight:
             if len(alive) == 0:
                 break
         return out
+
+
+def _unevenness(cells: F32) -> F64:
+    """Relative standard deviation of the light of cells that follow one another in the tree, (n_cells,)."""
+    light = cells.mean(axis=1, dtype=np.float64)
+    floor = 0.05 * light.mean()
+    last = np.clip(np.arange(len(light)) + _NEIGHBOURS // 2, min(_NEIGHBOURS, len(light)), len(light))
+    first = np.maximum(last - _NEIGHBOURS, 0)
+    one, two = (np.concatenate([[0.0], np.cumsum(light**power)]) for power in (1, 2))
+    mean = (one[last] - one[first]) / (last - first)
+    square = (two[last] - two[first]) / (last - first)
+    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0)) / np.maximum(mean, max(floor, 1e-30)))

@@ -45,6 +45,29 @@ def test_in_a_furnace_near_hits_send_the_light_of_the_furnace():
     assert abs(light.mean() - reflected) < 4 * error
 
 
+def test_hits_are_near_only_where_light_changes_from_cell_to_cell():
+    snapshot = closed_box(ALBEDO, EMISSION)
+    tracer = build_tracer(snapshot)
+    view = view_samples(snapshot, tracer, samples_per_pixel=1, seed=1)
+    gather = gather_samples(snapshot, tracer, view, n=64)
+    sampler = build_light_sampler(snapshot, tracer, view.points, 0)
+    cell = np.arange(-1, gather.n, dtype=np.int32)
+    close, far = np.float32(0.5), np.float32(2.0)
+    width = np.append(np.float32(0), np.sqrt(gather.area))
+
+    def near(cells: np.ndarray, widths: np.float32) -> np.ndarray:
+        light = NearLight(snapshot, tracer, sampler, gather, cells, N_PATHS, seed=2)
+        return light.is_near(widths * width + np.float32(1e-6), cell)
+
+    even, uneven = np.ones((gather.n, 3), np.float32), np.ones((gather.n, 3), np.float32)
+    uneven[gather.n // 2 :: 2] = 3.0
+    assert not near(even, close).any()
+    found = near(uneven, close)
+    assert not found[: gather.n // 4].any()
+    assert found[3 * gather.n // 4 :].all()
+    assert not near(uneven, far).any()
+
+
 def test_where_cells_are_coarse_near_hits_mend_contacts():
     scene = replace(SCENE, camera=replace(SCENE.camera, width=24, height=24))
     coarse = Pipeline(scene, n_gather=192)
