@@ -9,12 +9,14 @@ from icheat_usd.kernels.mask_sheets import MaskSheets
 
 
 def mask_patches(sheets: MaskSheets, least_apart: float) -> MaskPatches:
-    """Patches within which the columns of sheets differ by less than twice a distance, of all instances with sheets.
+    """Patches within which the columns of sheets differ little, of all instances with sheets.
 
     Parameters
     ----------
     least_apart : float
-        Distance from where a patch begins, of all columns together. With 0 all of a patch is the same.
+        Of all columns together: between the middle of a cell and that of the first one of its patch, and between its
+        corners and its middle, else it is in no patch. Two places in one are at most four times as far apart; with 0
+        all of a patch is the same.
     """
     n_instances = len(sheets.begin) - 1
     # The sheets of an instance are in the order of their resolutions.

@@ -50,6 +50,8 @@ def painted_weights(casters: MaskTable, on_instances: Bool, steepness: tuple[F32
 def sent_by_group(solution: GatherSolution, *, with_transport: bool) -> F32:
     """What gather cells send, (n_cells, n_blocks, 4): a block for each group of lights, each with its brightness.
 
+    That of transport is below 0: what travels on it is not the light of cells, and near hits do not change it.
+
     Parameters
     ----------
     with_transport : bool
@@ -62,6 +64,7 @@ def sent_by_group(solution: GatherSolution, *, with_transport: bool) -> F32:
     if with_transport:
         sent[:, n_groups, :3] = 1
     sent[:, :, 3] = sent[:, :, :3].sum(axis=2)
+    sent[:, n_groups:, 3] *= -1
     return sent
 
 

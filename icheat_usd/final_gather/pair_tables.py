@@ -185,6 +185,7 @@ class PairSums:
             np.searchsorted(rays.adjusted, rays.n_rays * np.arange(n + 1)),
             rays.adjusted,
             np.ascontiguousarray(rays.throughput, np.float32),
+            rays.way(),
             share,
             shrink,
         )

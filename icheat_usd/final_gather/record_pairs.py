@@ -105,15 +105,18 @@ class RecordPairs:
                 receivers = receivers._replace(place=place)
             seen = np.take(self._b, np.take(rays.cell.reshape(-1), flat), axis=1)
             found = self._field.evaluate(seen, receivers.take(row[touched]), self._casters.take(touched))
-            if self._sent is None:
-                changed = found.light(seen) - seen.sum(axis=0)
-            else:
+            sent = seen
+            if self._sent is not None:
                 sent = np.take(self._sent, np.take(rays.cell.reshape(-1), flat), axis=1)
-                changed = weighted(found.scale, sent) - sent.sum(axis=0)
+            changed = weighted(found.scale, sent) - sent.sum(axis=0)
+            added = found.emission if self._sent is None else np.zeros_like(changed)
             if len(rays.adjusted):
                 entry = np.minimum(np.searchsorted(rays.adjusted, flat), len(rays.adjusted) - 1)
                 went = rays.adjusted[entry] == flat
                 changed[went] *= rays.throughput[entry[went]]
+                added = added.copy()
+                added[went] *= rays.way()[entry[went]]
+            changed += added
             out.reshape(-1, 3)[flat] = changed
         return out[rows]
 

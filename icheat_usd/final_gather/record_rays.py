@@ -57,6 +57,11 @@ class RecordRays(NamedTuple):
             flat[self.adjusted] *= np.tile(self.throughput, found.shape[-1] // 3)
         return found
 
+    def way(self) -> F32:
+        """What the way of rays `adjusted` leaves of light that does not come from cells, (k, 3): 1 of near hits."""
+        went = np.isin(self.adjusted, self.detour, assume_unique=True)
+        return np.where(went[:, None], self.throughput, np.float32(1)).astype(np.float32)
+
     def ends(self, snapshot: SceneSnapshot, flat: I64) -> SurfacePoints:
         """Surfaces that send light along rays `flat`, ascending numbers ``row * n_rays + ray``."""
         row, ray = flat // self.n_rays, flat % self.n_rays

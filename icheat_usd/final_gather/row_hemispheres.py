@@ -58,7 +58,7 @@ def collect(
             n_casters += len(flat)
             row, ray = flat // rays.n_rays, flat % rays.n_rays
             strangers.append(rays.ends(snapshot, rows[row] * rays.n_rays + ray))
-        adjusted, throughput = _adjusted(rays, rows)
+        adjusted, throughput, way = _adjusted(rays, rows)
         columns.append(
             (
                 cell,
@@ -68,19 +68,21 @@ def collect(
                 rays.stream[rows],
                 adjusted + n_rows * rays.n_rays,
                 throughput,
+                way,
                 share[owner[rows]],
                 hemispheres.shrink[owner[rows]],
                 wanted[owner[rows]],
             )
         )
         n_rows += len(rows)
-    cell, caster, distance, normal, stream, adjusted, throughput, shares, shrink, record = (
+    cell, caster, distance, normal, stream, adjusted, throughput, way, shares, shrink, record = (
         np.concatenate(column) for column in zip(*columns, strict=True)
     )
     first = np.searchsorted(adjusted, cell.shape[1] * np.arange(len(cell) + 1))
+    tints = throughput, way
     order = np.argsort(record, kind="stable")
     return Collected(
-        kernels.HemisphereTable(cell, caster, distance, normal, stream, first, adjusted, throughput, shares, shrink),
+        kernels.HemisphereTable(cell, caster, distance, normal, stream, first, adjusted, *tints, shares, shrink),
         order,
         wanted,
         np.searchsorted(record[order], np.arange(len(records) + 1)),
@@ -94,11 +96,11 @@ def _strangers(cell: I32, instance: I32, of_cell: I32, varied: U8) -> I64:
     return found[: kernels.find_strangers(cell, instance, of_cell, varied, found)]
 
 
-def _adjusted(rays: RecordRays, rows: I64) -> tuple[I64, F32]:
-    """Numbers among the rays of some rows of those that bring other light than cells, and what they bring over that."""
+def _adjusted(rays: RecordRays, rows: I64) -> tuple[I64, F32, F32]:
+    """Numbers among the rays of some rows of those that bring other light than cells, and their tints."""
     place = np.full(len(rays.stream), -1, np.int64)
     place[rows] = np.arange(len(rows))
     row = place[rays.adjusted // rays.n_rays]
     kept = np.flatnonzero(row >= 0)
     number = row[kept] * rays.n_rays + rays.adjusted[kept] % rays.n_rays
-    return number, np.ascontiguousarray(rays.throughput[kept], np.float32)
+    return number, np.ascontiguousarray(rays.throughput[kept], np.float32), rays.way()[kept]

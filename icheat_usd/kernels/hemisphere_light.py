@@ -24,6 +24,7 @@ class HemisphereTable(NamedTuple):
     adjusted_begin: NDArray[np.int64]  #: (n + 1,)
     adjusted: NDArray[np.int64]  #: ascending numbers ``row * n_rays + ray``
     throughput: NDArray[np.float32]  #: (n_adjusted, 3)
+    way: NDArray[np.float32]  #: (n_adjusted, 3) what the way leaves of any light
     share: NDArray[np.float32]  #: (n,) in its record
     shrink: NDArray[np.float32]  #: (n,) factor on what changes with place
 
@@ -73,9 +74,10 @@ def arriving(h, ray, a, hemispheres, sent, emits, light):  # type: ignore[no-unt
     is_adjusted = a < hemispheres.adjusted_begin[h + 1] and hemispheres.adjusted[a] == h * n_rays + ray
     for c in range(3):
         tint = hemispheres.throughput[a, c] if is_adjusted else np.float32(1.0)
+        way = hemispheres.way[a, c] if is_adjusted else np.float32(1.0)
         for g in range(n_groups):
             light[g, c] = tint * sent[g, cell, c] if cell >= 0 else np.float32(0.0)
-        light[n_groups, c] = tint if emits else np.float32(0.0)
+        light[n_groups, c] = way if emits else np.float32(0.0)
     return a + 1 if is_adjusted else a
 
 

@@ -28,7 +28,7 @@ class MaskPatches(NamedTuple):
 def find_patches(  # type: ignore[no-untyped-def]
     begin, resolution, first, widths, texels, finest, first_cell, n_faces, least_apart, patch, number
 ):
-    """Cells taken together whose corners are all within a distance of where a patch began.
+    """Cells taken together whose middles are within a distance of that of the first one.
 
     Parameters
     ----------

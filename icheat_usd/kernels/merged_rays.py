@@ -50,7 +50,7 @@ def merge_rays(  # type: ignore[no-untyped-def]
     face : (n_triangles,) int32, face_uv : (n_triangles, 3, 2) float32
         Control faces, and places of corners in them.
     sent : (n_cells, n_blocks, 4) float32
-        What cells send, by group of lights, and how bright that is.
+        What cells send, by group of lights, and how bright that is; below 0 where it is transport.
     order : (n_wanted,) int64
         Hemispheres, those of one record next to each other.
     group : (n_groups + 1,) int64
@@ -264,11 +264,11 @@ def _take_together(  # type: ignore[no-untyped-def]
             if is_painted:
                 size_of_light = np.float32(0.0)
                 for block in range(n_blocks):
-                    if is_adjusted:
+                    if is_adjusted and (is_detour or sent[sender, block, 3] >= np.float32(0.0)):
                         for c in range(3):
                             size_of_light += sent[sender, block, c] * throughput[a - 1, c]
                     else:
-                        size_of_light += sent[sender, block, 3]
+                        size_of_light += abs(sent[sender, block, 3])
                 bright[last] += size_of_light
                 to = mean_0 + 4 * width * last
                 for sheet in range(sheet_begin[i], sheet_begin[i + 1]):
@@ -279,7 +279,7 @@ def _take_together(  # type: ignore[no-untyped-def]
                     to += 4 * wide
             for block in range(n_blocks):
                 brought = load_color(sent_0 + 16 * (sender * n_blocks + block))
-                if is_adjusted:
+                if is_adjusted and (is_detour or sent[sender, block, 3] >= np.float32(0.0)):
                     brought = color_product(brought, load_rgb(throughput_0 + 12 * (a - 1)))
                 add_weighted(light_0 + 16 * N_VALUES * (last * n_blocks + block), brought, share, weight_0, ray)
     # All of a record stand at one place.

@@ -40,7 +40,7 @@ def painted_sums(  # type: ignore[no-untyped-def]
     face : (n_triangles,) int32, face_uv : (n_triangles, 3, 2) float32
         Control faces, and places of corners in them.
     sent : (n_cells, n_blocks, 4) float32
-        What cells send, by group of lights.
+        What cells send, by group of lights, as for `merged_rays.merge_rays`.
     local : (n, n_rays) int16, as of `list_casters`
     share : (n,) float32
         Factor on each hemisphere.
@@ -149,7 +149,7 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
         base = first[begin + place] - first[begin]
         for block in range(n_blocks):
             light = load_color(sent_0 + 16 * (np.int64(cell[r, ray]) * n_blocks + block))
-            if is_adjusted:
+            if is_adjusted and (is_detour or sent[cell[r, ray], block, 3] >= np.float32(0.0)):
                 light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
             for subset in range(least, n):
                 if product[subset] != np.float32(0.0):
