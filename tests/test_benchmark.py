@@ -44,7 +44,10 @@ def test_every_suite_reports(tmp_path: Path) -> None:
     for light in lights.values():
         assert {"total", "at_rest", "packing", "interpolation_and_packing", "what"} <= light.keys()
     assert all(edit["of_unedited"] > 0 for edit in results["errors"][0]["edits"].values())
-    assert [point["tolerance"] for point in results["errors"][0]["curve"]] == [0.1, 0.02]
+    assert [(point["by"], point["setting"]) for point in results["errors"][0]["curve"]] == [
+        ("tolerance of packing", 0.1), ("tolerance of packing", 0.02), ("share of samples with rows", 0.3)
+    ]  # fmt: skip
+    assert all(point["whole_seconds"] > 0 for point in results["errors"][0]["curve"])
     for image in results["errors"][0]["images"]:
         assert list((tmp_path / "images").rglob(image)), image
 

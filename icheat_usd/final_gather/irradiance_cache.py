@@ -45,7 +45,9 @@ class CacheSettings:
     accuracy: float = 0.35  #: reach of a record, in harmonic mean distances of the surfaces around
     clearance: float = 1.0  #: and no more of the distance of the nearest one
     least_reach: float = 2.5  #: pixels
-    most_reach: float = 24.0  #: pixels
+    #: Pixels. What a record says of places farther off is up to a tenth wrong where light falls on surfaces at grazing
+    #: angles, and wide blots show once records are not noisy; with more noise than the usual, 24 is better.
+    most_reach: float = 12.0
     most_turn: float = 20.0  #: degrees between normals
     tolerance: float = 0.1  #: relative error of a record's own prediction at another, from which it ends before that
     coverage: float = 0.5  #: sum of weights at a place, 1 at a record itself, from which it needs no record of its own

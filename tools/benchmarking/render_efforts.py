@@ -32,23 +32,30 @@ EFFORTS: dict[str, RenderEffort] = {
             1,
             light_samples=1,
             edge_samples=1,
-            cache=CacheSettings(n_theta=8, noise=0.2, least_reach=5.0, coverage=0.3, near_paths=0),
+            cache=CacheSettings(n_theta=8, noise=0.2, least_reach=5.0, most_reach=24.0, coverage=0.3, near_paths=0),
         ),
     ),
     "cached 0": _cached(
         16_384,
         64,
         2,
-        GatherSettings(1, light_samples=1, edge_samples=3, cache=CacheSettings(noise=0.05, least_reach=3.0)),
+        GatherSettings(
+            1, light_samples=1, edge_samples=3, cache=CacheSettings(noise=0.05, least_reach=3.0, most_reach=24.0)
+        ),
     ),
     "cached 1": _cached(
-        32_768, 64, 2, GatherSettings(1, light_samples=1, edge_samples=7, cache=CacheSettings(noise=0.03))
+        32_768,
+        64,
+        2,
+        GatherSettings(1, light_samples=1, edge_samples=7, cache=CacheSettings(noise=0.03, most_reach=24.0)),
     ),
     "cached 2": _cached(
         65_536,
         64,
         4,
-        GatherSettings(1, light_samples=1, edge_samples=15, cache=CacheSettings(noise=0.02, coverage=0.8)),
+        GatherSettings(
+            1, light_samples=1, edge_samples=15, cache=CacheSettings(noise=0.02, most_reach=24.0, coverage=0.8)
+        ),
     ),
     "cached 3": _cached(
         65_536, 128, 8, GatherSettings(2, light_samples=2, edge_samples=14, cache=CacheSettings(noise=0.0125))
@@ -61,7 +68,7 @@ EFFORTS: dict[str, RenderEffort] = {
             4,
             light_samples=2,
             edge_samples=28,
-            cache=CacheSettings(n_theta=16, noise=0.006, least_reach=1.5, coverage=0.8),
+            cache=CacheSettings(n_theta=16, noise=0.006, least_reach=1.5, most_reach=8.0, coverage=0.8),
         ),
     ),
 }
