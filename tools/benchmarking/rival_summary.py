@@ -18,7 +18,7 @@ _MEASURES = {"rel_mse": "untrimmed", "rel_mse_trimmed": "trimmed"}
 #: over the denoiser's.
 _EFFICIENCY, _OTHER_EFFICIENCY, _OVER_DENOISED = {"cornell_box": 50.0}, 10.0, 0.5
 
-#: A curve is used this much beyond its ends.
+#: A curve is used this much beyond its ends; ours on and on, as a picture that is there stays there.
 _SLACK = 1.1
 
 
@@ -35,18 +35,20 @@ def curves_of(results: list[dict[str, Any]]) -> dict[str, dict[str, list[dict[st
     }
 
 
-def error_at(points: list[dict[str, Any]], measure: str, seconds: float) -> float | None:
+def error_at(points: list[dict[str, Any]], measure: str, seconds: float, *, stays: bool = False) -> float | None:
     """Error after so many seconds, interpolated in the logarithms; None where the curve does not reach.
 
     A slower point with a larger error than a quicker one is left out: nobody would choose it. So are errors that the
-    noise of the reference drowns.
+    noise of the reference drowns. With `stays` the last one holds for ever: for those whose efforts end before the
+    time that all others are given.
     """
     times, values = [], []
     for point in sorted(points, key=lambda point: point["seconds"]):
         if point[measure] > 0 and (not values or point[measure] < values[-1]):
             times.append(point["seconds"])
             values.append(point[measure])
-    if not times or not times[0] / _SLACK <= seconds <= max(p["seconds"] for p in points) * _SLACK:
+    last = np.inf if stays else max((point["seconds"] for point in points), default=0.0) * _SLACK
+    if not times or not times[0] / _SLACK <= seconds <= last:
         return None
     return float(np.exp(np.interp(np.log(seconds), np.log(times), np.log(values))))
 
@@ -64,7 +66,10 @@ def comparison(curves: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
                 point["label"]: product / (point[measure] * point["seconds"]) for point in ours if point[measure] > 0
             }
         pairs = {
-            seconds: (error_at(ours, measure, seconds), error_at(curves.get(DENOISED, []), measure, seconds))
+            seconds: (
+                error_at(ours, measure, seconds, stays=True),
+                error_at(curves.get(DENOISED, []), measure, seconds),
+            )
             for seconds in AT_SECONDS
         }
         found["over_denoised"][measure] = {
