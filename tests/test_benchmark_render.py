@@ -106,7 +106,7 @@ def test_curves_are_compared_at_equal_time() -> None:
     assert over.keys() == {"1", "4", "16", "64"}
     assert over["64"] == pytest.approx(0.001 / (0.01 / 64))  # What was done after 16 s is still there.
     short = rival_summary.comparison({"mitsuba llvm + OIDN": denoised[:-1], "ours": ours})
-    assert short["over_denoised"]["rel_mse"].keys() == {"1", "4", "16"}  # That the denoiser gets no better is not known.
+    assert short["over_denoised"]["rel_mse"].keys() == {"1", "4", "16"}  # Nobody knows about the denoiser.
     assert over["1"] == pytest.approx(0.005 / 0.01)
     # Between 1 s and 16 s on a straight line in the logarithms, past the point that is worse than a quicker one.
     assert over["4"] == pytest.approx(np.sqrt(0.005 * 0.001) / 0.0025)
