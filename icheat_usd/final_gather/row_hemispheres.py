@@ -79,10 +79,11 @@ def collect(
         np.concatenate(column) for column in zip(*columns, strict=True)
     )
     first = np.searchsorted(adjusted, cell.shape[1] * np.arange(len(cell) + 1))
-    tints = throughput, way
     order = np.argsort(record, kind="stable")
     return Collected(
-        kernels.HemisphereTable(cell, caster, distance, normal, stream, first, adjusted, *tints, shares, shrink),
+        kernels.HemisphereTable(
+            cell, caster, distance, normal, stream, first, adjusted, throughput, way, shares, shrink
+        ),
         order,
         wanted,
         np.searchsorted(record[order], np.arange(len(records) + 1)),

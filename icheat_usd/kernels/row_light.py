@@ -216,7 +216,7 @@ def _lanes_of_one(h, hemispheres, stack, one, key, groups, kind, sent, emits, li
                     if groups[g]:
                         light += mask * sent[g, cell, c]
             if is_adjusted:
-                light *= hemispheres.throughput[a - 1, c]
+                light *= hemispheres.way[a - 1, c] if kind == 1 else hemispheres.throughput[a - 1, c]
             for i in range(5):
                 lanes[n, 5 * c + i] = light * linear[ray, i]
         n += 1

@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from icheat_usd.edits.model import Edit
+from icheat_usd.final_gather import near_hits
 from icheat_usd.final_gather.near_hits import NearLight
 from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import take_points
 from icheat_usd.samples import gather_samples, view_samples
 from icheat_usd.tracing import build_tracer
-from tests.final_gather.test_edits import SCENE
-from tests.pipeline import TINY, Pipeline
+from tests.final_gather.test_edits import SCENE, SIDES, painted
+from tests.final_gather.test_rows import glow
+from tests.pipeline import TINY, Pipeline, select
 from tests.scenes import closed_box
 
 ALBEDO, EMISSION, N_PATHS = 0.5, 0.3, 4
@@ -78,3 +82,33 @@ def test_where_cells_are_coarse_near_hits_mend_contacts():
         found = coarse.final(method="cached", samples=4, cache=cache).indirect
         error.append(((found - halves[0]) * (found - halves[1])).mean())
     assert error[0] > 1.3 * error[1] > 0
+
+
+@pytest.mark.parametrize(
+    "kind", ["objects", "a painted mask", "painted masks", "pairs", "rows", "rows over each other"]
+)
+def test_what_edits_add_is_the_same_where_hits_are_near(kind, monkeypatch):
+    monkeypatch.setattr(near_hits, "EVEN", 0.0)
+    emission = {"color": (0.3, 0.1, 0.6)}
+    ground = select("/floor", "/back")
+    edits = {
+        "objects": lambda: (Edit("/emit", "emit", emission, ground, SIDES),),
+        "a painted mask": lambda: (painted("emit", emission),),
+        "painted masks": lambda: (painted("emit", emission), replace(painted("emit", emission), path="/more")),
+        "pairs": lambda: (
+            Edit("/emit", "emit", emission, ground, SIDES),
+            Edit("/near", "falloff", {"exponent": 1.5}, select("/ceiling"), SIDES),
+        ),
+        "rows": lambda: (glow(),),
+        "rows over each other": lambda: (glow(), replace(glow(), path="/more", amount=0.5)),
+    }[kind]()
+    scene = replace(SCENE, camera=replace(SCENE.camera, width=24, height=24))
+    coarse = Pipeline(scene, n_gather=192)
+    unedited, added = [], []
+    for n_paths in (0, 4):
+        found = coarse.final(*edits, method="cached", samples=4, cache=replace(TINY, near_paths=n_paths))
+        unedited.append(found.indirect.mean())
+        # The lower half sees no ceiling, whose edit is one of the light as it is.
+        added.append((found.indirect_edited - found.indirect)[12:].mean())
+    assert abs(unedited[1] / unedited[0] - 1) > 2e-3
+    assert added[1] == pytest.approx(added[0], rel=1e-4)
