@@ -260,6 +260,13 @@ def _film_chunk(begin, end, table, products, own, direct, seen, in_order, film):
         _dim(first, n, dimmed_view, throughput, buffer[: 3 * n].reshape(n, 3))
         _sum_samples(begin, end, sample_begin, indirect, base)
     buffer[0] = np.float32(0.0)  # keeps it, see `_sum_run`
+    _add_still(begin, end, still_pixel, still, film)
+
+
+@kernel
+def _add_still(begin, end, still_pixel, still, film):  # type: ignore[no-untyped-def]
+    """Add what some of the pixels ``begin:end`` emit or show behind."""
+    base = address_of(film)
     for s in range(np.searchsorted(still_pixel, begin), np.searchsorted(still_pixel, end)):
         place = base + 12 * np.int64(still_pixel[s])
         store_rgb(place, scale_add(load_rgb(address_of(still) + 12 * s), np.float32(1.0), load_rgb(place)))
@@ -300,3 +307,44 @@ def assemble_film(table, products, own, direct, seen, film):  # type: ignore[no-
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         begin = chunk * _CHUNK
         _film_chunk(begin, min(n, begin + _CHUNK), table, products, own, direct, seen, in_order[chunk], film)
+
+
+@kernel
+def _sum_films_run(first, n, direct, out):  # type: ignore[no-untyped-def]
+    kept, lights, gains = direct
+    some, light_0, gain_0 = address_of(kept) + 12 * first, address_of(lights) + 12 * first, address_of(gains)
+    step, is_kept = 12 * lights.shape[1], len(kept) > 0
+    for _ in range(n // 16):
+        for third in range(3):
+            total = load(some + 64 * third) if is_kept else zeros()
+            light, gain = light_0 + 64 * third, gain_0 + 64 * third
+            for _ in range(len(gains)):
+                total = multiply_add(load(light), load(gain), total)
+                light += step
+                gain += 192
+            store(out + 64 * third, total)
+        some += 192
+        light_0 += 192
+        out += 192
+    for _ in range(n % 16):
+        one = load_rgb(some) if is_kept else black()
+        light, gain = light_0, gain_0
+        for _ in range(len(gains)):
+            one = color_add(load_rgb(light), load_rgb(gain), one)
+            light += step
+            gain += 192
+        store_rgb(out, one)
+        some += 12
+        light_0 += 12
+        out += 12
+
+
+@parallel_kernel
+def sum_films(direct, still_pixel, still, film):  # type: ignore[no-untyped-def]
+    """Image of images of lights: `direct` as for `assemble_film`, but of pixels; `still_pixel`, `still` the same."""
+    n = len(film)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        first = chunk * _CHUNK
+        end = min(n, first + _CHUNK)
+        _sum_films_run(first, end - first, direct, address_of(film) + 12 * first)
+        _add_still(first, end, still_pixel, still, film)

@@ -106,8 +106,10 @@ class AtomSums:
         self.cells = {number[v]: some for v, some in self.cells.items() if v in number}
         self.atoms = kept
 
-    def add_up(self, versions: list[int], tables: VersionTables, compiled: CompiledStack, pairs: PairLists) -> None:
-        """Make the products of some versions from those of their atoms."""
+    def add_up(
+        self, versions: list[int], tables: VersionTables, compiled: CompiledStack, pairs: PairLists, values: F32
+    ) -> None:
+        """Make the products of some versions from those of their atoms, all among `values` of the pairs."""
         cells = [self.cells[v] for v in versions]
         begin = np.concatenate([[0], np.cumsum([len(some) for some in cells])]).astype(np.int64)
         factors, no_offsets = np.zeros((int(begin[-1]), 3), np.float32), np.zeros((len(versions), 6))
@@ -124,7 +126,7 @@ class AtomSums:
             np.concatenate([self.atoms[v] for v in versions]),
             np.tile(np.pad(factors, ((0, 0), (0, 1))), (1, 16)),
             pairs.of,
-            pairs.values,
+            values,
         )
 
     def with_some(self, atom: int) -> set[int]:

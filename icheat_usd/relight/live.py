@@ -17,9 +17,11 @@ from icheat_usd.kernels import terms as kernels
 from icheat_usd.kernels.assemble import sum_scaled
 from icheat_usd.kernels.film_table import FilmTable, film_table
 from icheat_usd.relight.alone import AloneSamples
+from icheat_usd.relight.amount_films import AmountFilms
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.direct_sum import DirectSum
 from icheat_usd.relight.groups import SampleGroups, TermTable, versions_of
+from icheat_usd.relight.light_films import ROUNDED, AtRest, LightFilms
 from icheat_usd.relight.live_stack import CASTERS, RECEIVERS, Change, LiveStack
 from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.pair_products import PairProducts
@@ -88,6 +90,8 @@ class LiveRelighter:
         self._lights_seen: Any = None
         self._moves_seen: Any = None
         self._light_stale = True
+        self._films = LightFilms()
+        self._amounts = AmountFilms()
         self._changed_rows: set[int] = set()
         self._stack = LiveStack(snapshot, view, gather, True)
         self.set_transport(transport)
@@ -105,6 +109,8 @@ class LiveRelighter:
         if exact is None:
             self._refuse_pairs()
         self.transport = transport
+        self._films.forget()
+        self._amounts.forget()
         self._products = Products(transport, self.gather.tree)
         self._table = _table(self._products)
         self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
@@ -204,12 +210,16 @@ class LiveRelighter:
         image = np.empty(shape, np.float32) if out is None else out
         if image.shape != shape or image.dtype != np.float32:
             raise SampleSetMismatch(f"an image of shape {image.shape} {image.dtype} cannot hold {shape} float32")
-        self._update()
         lights = self.lights
-        direct = self._direct.now(lights.view_direct, lights.gains, getattr(lights, "light_moves", None))
         is_flat = image.flags.c_contiguous
         film = image.reshape(-1, 3) if is_flat else np.empty((shape[0] * shape[1], 3), np.float32)
-        self._shared.film(self._own_light, direct, self._seen, film)
+        self._look_at_lights()
+        if self._films.hold(self._moves_seen):
+            self._films.add_up(lights.gains, self._seen, film)
+        elif self._is_between():
+            self._amounts.between(self._stack.edit(self._amounts.path).amount, film)
+        else:
+            self._show_film(film)
         if not is_flat:
             image[:] = film.reshape(shape)
         return image
@@ -217,12 +227,8 @@ class LiveRelighter:
     def relit(self) -> RelitView:
         """Light of every view sample, in layers."""
         self._update()
-        edited = np.empty_like(self._base)
-        self._shared.edited(edited)
-        own = self._own_light
-        edited[own.samples], edited[own.added] = own.light[own.samples], edited[own.added] + own.light[own.added]
         # Held at 0 or above once, at the end, as in the film.
-        unedited, edited = (np.maximum(light, np.float32(0)) for light in (self._unedited(), edited))
+        unedited, edited = (np.maximum(light, np.float32(0)) for light in (self._unedited(), self._edited()))
         return RelitView(np.ascontiguousarray(self.lights.direct(), np.float32), unedited, edited)
 
     def refine(self) -> bool:
@@ -232,7 +238,8 @@ class LiveRelighter:
         stays where it is follows from its exact product, under all gains; of one that moves, so does what it has in
         common with what it was. Edited light is taken from its exact products in the same way: only what it does not
         have in common with what it was is multiplied, at rest with the part of the packed rows that matters to these
-        lights and edits. Versions that are new, or whose casters were painted, are multiplied as a whole.
+        lights and edits. Versions that are new, or whose casters were painted, are multiplied as a whole. Where edited
+        light is a sum over lights, each has an image at last, and under other gains a frame is the sum of these.
         """
         if self.lights.refine():
             return True
@@ -241,14 +248,17 @@ class LiveRelighter:
             if self._narrow.step(self.lights.radiance, self.lights.gains, self._versions.n):
                 self._versions.forget_products()
                 self._versions.update()
+                self._amounts.forget()
                 return True
             if self._versions.refine(self._exact_products):
+                self._amounts.forget()
                 return True
             if self._n_exact < self._exact_products.n_tiles:
                 self._n_exact = self._shared.refine_unedited(self._light(), self._exact_products, self._n_exact)
                 self._base_stale = True
                 return True
             self._show(self._mixed_samples)
+            return self._films.step(self._at_rest(), self.lights.radiance, self.lights.view_direct, self._moves_seen)
         return False
 
     # Structure --------------------------------------------------------------------------------------------------------
@@ -257,6 +267,10 @@ class LiveRelighter:
         """Change the stack and what follows from it; after an error all is as it was."""
         before = copy.copy(self._stack)
         change = act()
+        if change is not None and change.is_none:
+            return
+        self._films.forget()
+        self._amounts.changed("" if change is None else change.amount_of)
         if change is None:
             try:
                 self._regroup()
@@ -404,8 +418,29 @@ class LiveRelighter:
 
     # Evaluation -------------------------------------------------------------------------------------------------------
 
+    def _at_rest(self) -> AtRest:
+        """What images of lights are made of."""
+        assert self._narrow is not None and self._exact_products is not None
+        stack = self._stack
+        return AtRest(
+            self._shared,
+            self._narrow,
+            self._versions,
+            self._terms,
+            self._products,
+            self._exact_products,
+            stack.receiver_masks,
+            self._own_light,
+            self._seen,
+            stack.field.light_group,
+            stack.field.n_groups,
+        )
+
     def _update(self) -> None:
         self._look_at_lights()
+        self._evaluate()
+
+    def _evaluate(self) -> None:
         if not self._light_stale and not self._changed_rows and not self._changed_samples:
             return
         if self._light_stale:
@@ -430,6 +465,44 @@ class LiveRelighter:
         self._shared.add_up(self._terms.alike, self._versions)
         self._edit(samples)
 
+    def _show_film(self, film: F32) -> None:
+        """Evaluate what has changed, and put the image into `film` (n_pixels, 3)."""
+        self._evaluate()
+        lights = self.lights
+        direct = self._direct.now(lights.view_direct, lights.gains, getattr(lights, "light_moves", None))
+        self._shared.film(self._own_light, direct, self._seen, film)
+
+    def _edited(self) -> F32:
+        """Edited indirect light of all view samples, which may be below 0."""
+        edited, own = np.empty_like(self._base), self._own_light
+        self._shared.edited(edited)
+        edited[own.samples], edited[own.added] = own.light[own.samples], edited[own.added] + own.light[own.added]
+        return edited
+
+    def _is_between(self) -> bool:
+        """Whether the image lies between two of other amounts; these are made when they are wanted."""
+        amounts = self._amounts
+        if amounts.are_wanted() and self._rests and self._versions.are_linear and not len(self._own_light.samples):
+            shown = self._stack.stack
+            images = np.empty((2, self.view.width * self.view.height, 3), np.float32)
+            lights = []
+            for image, amount in zip(images, (1.0, 0.5), strict=True):
+                self.set_amount(amounts.path, amount)
+                self._show_film(image)
+                lights.append(self._edited())
+            self.set_stack(shown)
+            # What is held at 0 is not affine.
+            least = min(lights[0].min(initial=0), (2 * lights[1] - lights[0]).min(initial=0))
+            if least >= -ROUNDED * lights[0].max(initial=0):
+                amounts.put(*images)
+        return bool(amounts.path) and amounts.hold(self._stack.edit(amounts.path).amount)
+
+    @property
+    def _rests(self) -> bool:
+        """Whether unedited light is exact."""
+        exact = self._exact_products
+        return exact is not None and self._n_exact == exact.n_tiles and not self._light_stale
+
     def _unedited(self) -> F32:
         """Unedited indirect light of all view samples."""
         if self._base_stale:
@@ -443,11 +516,14 @@ class LiveRelighter:
             self._command(lambda: self._stack.set_stack(self._stack.stack, self._light_paths()))
         # Lights that do not tell are taken to have changed.
         self._light_stale |= revision is None or revision != self._lights_seen
+        if self._light_stale:
+            self._amounts.forget()
         self._lights_seen = revision
         moved = getattr(self.lights, "moves", revision)
         if moved is None or moved != self._moves_seen:
             if self._narrow is not None:
                 self._narrow.forget()
+            self._films.forget()
         self._moves_seen = moved
 
     def _light_paths(self) -> tuple[str, ...]:

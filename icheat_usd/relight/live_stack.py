@@ -33,7 +33,13 @@ class Change(NamedTuple):
     painted: list[int]  #: rows whose caster masks are others
     before: I64 | None = None  #: (n_rows,) row that each row was, -1 for new ones; None: rows are the same
     n_before: int = 0  #: rows that there were then
+    amount_of: str = ""  #: path of the edit whose amount has changed, if nothing else has
     gone: tuple[int, ...] = ()  #: rows of `LiveStack.receiver_masks` that were given up, or given to new rows
+
+    @property
+    def is_none(self) -> bool:
+        """Whether the image stays as it is: the same stack was set again."""
+        return self.before is None and not (self.rows or len(self.samples) or self.painted)
 
 
 class _Exchange(NamedTuple):
@@ -45,6 +51,7 @@ class _Exchange(NamedTuple):
     receivers: list[tuple[int, I64, F32]]  #: key, view samples and weights
     casters: list[tuple[int, I64, F32]]  #: key, gather samples and weights
     sends_otherwise: bool
+    amount_alone: bool  #: nothing but the amount differs
 
 
 class _Weights(NamedTuple):
@@ -165,7 +172,7 @@ class LiveStack:
         n_before, self.mask_rows = len(self.mask_rows), mask_rows
         self._take(stack, field, compiled, light_paths)
         given_up = tuple(np.concatenate([gone, mask_rows[~stays]]).tolist())
-        return Change([], _flagged(changed, masks.shape[1]), [], before, n_before, given_up)
+        return Change([], _flagged(changed, masks.shape[1]), [], before, n_before, gone=given_up)
 
     def _show_anew(self, stack: EditStack, field: EditField, light_paths: tuple[str, ...]) -> None:
         compiled = self._compiled(field)
@@ -254,6 +261,7 @@ class LiveStack:
     def _exchange(self, changed: list[tuple[int, Edit]]) -> Change | None:
         """Put edits in the place of others of the same structure; None if their numbers do not fit after all."""
         exchanges = [self._exchanged(edit, now) for edit, now in changed]
+        amount_of = exchanges[0].bound.edit.path if len(exchanges) == 1 and exchanges[0].amount_alone else ""
         compiled = self.compiled
         if any(len(new) != len(compiled.slots_of(row)) for found in exchanges for row, new in found.numbers):
             return None
@@ -278,7 +286,8 @@ class LiveStack:
         rows = [row for found in exchanges if found.sends_otherwise for row in self._rows(found.edit)]
         # Points of one mask are ascending already.
         painted = [self._rows(found.edit).start + key for found in exchanges for key, _, _ in found.casters]
-        return Change(rows, samples[-1] if len(samples) < 3 else np.unique(np.concatenate(samples)), painted)
+        some = samples[-1] if len(samples) < 3 else np.unique(np.concatenate(samples))
+        return Change(rows, some, painted, amount_of=amount_of)
 
     def _exchanged(self, edit: int, now: Edit) -> _Exchange:
         before = self.field.edits[edit]
@@ -303,7 +312,8 @@ class LiveStack:
                     cells = np.flatnonzero(self.compiled.support[row])
                     numbers.append((row, numbers_of(bound, key, self._gather, cells)))
         sends_otherwise = bound.parameters is not before.parameters or not weights_stay or bool(sides[1])
-        return _Exchange(edit, bound, numbers, sides[0], sides[1], sends_otherwise)
+        amount_alone = recipe_stays and not any(sides) and bound.key_weights == before.key_weights
+        return _Exchange(edit, bound, numbers, sides[0], sides[1], sends_otherwise, amount_alone)
 
     def _repainted(
         self, bound: BoundEdit, key: int, side: str, was: SurfaceMask | None, mask: SurfaceMask | None

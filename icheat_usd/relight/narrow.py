@@ -89,6 +89,11 @@ class Narrow:
         else:
             self._products.multiply_all(rest, out, known=add)
 
+    def products_of(self, light: int) -> F32:
+        """Exact products of a light as it was at rest, (n_lobes, n_tiles, 64, 4)."""
+        found: F32 = self._known[light].reshape(-1, self._exact.n_tiles, LANES, 4)
+        return found
+
     def _rest(self, light: int, radiance: F32, factors: F32) -> F32:
         """What of a light is not like it was at rest; what is goes to `factors`."""
         if light >= len(factors):

@@ -122,33 +122,41 @@ class SharedLight:
 
     def add_up(self, terms: TermTable, versions: Versions) -> None:
         """Make the sums of groups from the products of their terms."""
+        self._add_groups(terms, versions.pair_of, versions.values, self._sums)
+
+    def sums_of(self, unedited: F32, terms: TermTable, pair_of: I32, values: F32) -> F32:
+        """The same of other products: unedited ones (n_lobes, n_tiles, 64, 4), and `values` of the terms."""
+        sums = np.empty_like(self._sums)
+        sums[:, : self._products.n_tiles] = unedited
+        self._add_groups(terms, pair_of, values, sums)
+        return sums
+
+    def _add_groups(self, terms: TermTable, pair_of: I32, values: F32, sums: F32) -> None:
         if len(self._tile):
-            kernels.sum_products(
-                self._tile,
-                self._group,
-                terms.term_begin,
-                terms.term_version,
-                versions.pair_of,
-                versions.values,
-                self._products.n_tiles,
-                self._sums,
-            )
+            n_tiles, begin, version = self._products.n_tiles, terms.term_begin, terms.term_version
+            kernels.sum_products(self._tile, self._group, begin, version, pair_of, values, n_tiles, sums)
 
-    def edited(self, out: F32) -> None:
-        """Indirect light of all view samples into `out`: edited where a group shares it, else unedited."""
-        self._assemble(self._edited, out)
+    def edited(self, out: F32, sums: F32 | None = None) -> None:
+        """Indirect light of all view samples into `out`: edited where a group shares it, else unedited.
 
-    def film(self, own: OwnLight, direct: SummedLight, seen: SeenSamples, out: F32) -> None:
-        """The image with direct light into `out` (n_pixels, 3)."""
-        assemble_film(tuple(self._edited), self._flat_sums, tuple(own), tuple(direct), tuple(seen), out)
+        Parameters
+        ----------
+        sums
+            Of `sums_of`, in place of the present ones.
+        """
+        self._assemble(self._edited, out, sums)
 
-    @property
-    def _flat_sums(self) -> F32:
-        n_lobes, n_sums = self._sums.shape[:2]
-        return self._sums.reshape(n_lobes, n_sums * LANES, 4)
+    def film(self, own: OwnLight, direct: SummedLight, seen: SeenSamples, out: F32, sums: F32 | None = None) -> None:
+        """The image with direct light into `out` (n_pixels, 3); `sums` as for `edited`."""
+        assemble_film(tuple(self._edited), self._flat(sums), tuple(own), tuple(direct), tuple(seen), out)
 
-    def _assemble(self, table: FilmTable, out: F32) -> None:
-        assemble_view(tuple(table), self._flat_sums, out)
+    def _flat(self, sums: F32 | None) -> F32:
+        sums = self._sums if sums is None else sums
+        n_lobes, n_sums = sums.shape[:2]
+        return sums.reshape(n_lobes, n_sums * LANES, 4)
+
+    def _assemble(self, table: FilmTable, out: F32, sums: F32 | None = None) -> None:
+        assemble_view(tuple(table), self._flat(sums), out)
 
 
 def _entries_of(view: I32, samples: I64) -> I64:

@@ -100,8 +100,14 @@ class TermTables:
             out,
         )
 
-    def add_soft(self, samples: I64, masks: F32, products: Products, out: F32) -> None:
-        """Light of samples of groups that are soft, besides what they share; see `kernels.terms.soft_terms`."""
+    def add_soft(self, samples: I64, masks: F32, products: Products, out: F32, values: F32 | None = None) -> None:
+        """Light of samples of groups that are soft, besides what they share; see `kernels.terms.soft_terms`.
+
+        Parameters
+        ----------
+        values
+            Products of the versions with other light.
+        """
         spread, versions, table = products.interpolation, self._versions, self.soft
         kernels.soft_terms(
             samples,
@@ -116,7 +122,7 @@ class TermTables:
             spread.indices,
             spread.weights,
             versions.pair_of,
-            versions.values,
+            versions.values if values is None else values,
             products.tints,
             out,
         )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from icheat_usd.kernels.residuals import add_version_residuals, proportions
+from icheat_usd.kernels.versions import CONSTANT
 from icheat_usd.relight.atoms import Atoms, AtomSums, find_atoms
-from icheat_usd.relight.compiled import CompiledStack
+from icheat_usd.relight.compiled import CompiledStack, Way
 from icheat_usd.relight.growing import Growing
 from icheat_usd.relight.pair_products import PairProducts, PairSum
 from icheat_usd.relight.products import Products
@@ -316,7 +317,7 @@ class Versions:
     def _add_up(self) -> None:
         """Make the products of versions that are sums over atoms."""
         if self._unsummed:
-            self._sums.add_up(sorted(self._unsummed), self._lists.tables, self._compiled, self._pairs)
+            self._sums.add_up(sorted(self._unsummed), self._lists.tables, self._compiled, self._pairs, self.values)
         self._unsummed = set()
 
     def _pairs_of_some(self, versions: I64) -> I64:
@@ -381,6 +382,41 @@ class Versions:
             self._refined.add(v)
             self._unsummed |= self._sums.with_some(v)
         return False
+
+    @property
+    def are_linear(self) -> bool:
+        """Whether edited light is a sum over lights, each by itself, and all of it comes by products with versions."""
+        compiled = self._compiled
+        by_version = (compiled.way == Way.VERSION) & (compiled.row_table[:, 1] == CONSTANT) & ~compiled.gives_offset
+        return bool(by_version.all()) and not compiled.slots[:, 3:6].any()
+
+    @property
+    def n_multiplied(self) -> int:
+        """Products of pairs that do not follow from those of others."""
+        return sum(len(pairs) for v, pairs in enumerate(self._pairs.of_version) if v not in self._sums.atoms)
+
+    def room(self) -> F32:
+        """Place for products of all pairs."""
+        return self._products.room(self.values.shape[1])
+
+    def multiply_alone(self, b: F32, exact: Products, values: F32) -> Iterator[None]:
+        """Exact products of all pairs with other light (G, n_gather, 3), where versions are linear, step by step."""
+        tables, pairs_of = self._lists.tables, self._pairs.of_version
+        made = [v for v in range(self.n) if v not in self._sums.atoms and len(pairs_of[v])]
+        pieces = _pieces(np.array(made, np.int64), tables.cell_begin)
+        deltas, no_offsets = np.zeros_like(self._deltas), np.zeros((len(pieces), 6))
+        every = np.ones(1, np.uint8)
+        evaluate(pieces, every, tables, self._compiled, b, self._area, tables.cells, deltas, no_offsets)
+        for v in made:
+            some = self._lists.part(v)
+            for first in range(0, len(pairs_of[v]), _PAIRS_AT_ONCE):
+                pairs = pairs_of[v][first : first + _PAIRS_AT_ONCE]
+                found = exact.room(len(pairs))
+                exact.multiply_cells(tables.cells[some], deltas[some], self._pairs.tile[pairs], found)
+                values[:, pairs] = found
+                yield
+        if self._sums.atoms:
+            self._sums.add_up(sorted(self._sums.atoms), tables, self._compiled, self._pairs, values)
 
     def _learn(self, v: int, exact: F32) -> None:
         """Keep a version's exact products, and what they are the products of."""

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.assemble import assemble_film, assemble_view, chunks_in_order, sum_scaled
+from icheat_usd.kernels.assemble import assemble_film, assemble_view, chunks_in_order, sum_films, sum_scaled
 from icheat_usd.kernels.film_table import FilmTable, film_table
 from icheat_usd.relight.direct_sum import DirectSum
 from icheat_usd.scene import F32, F64, I32
@@ -115,6 +115,19 @@ def test_sum_of_lights() -> None:
     out = np.full((2500, 3), np.nan, np.float32)
     sum_scaled(values, gains, out)
     np.testing.assert_allclose(out, (values.astype(np.float64) * gains[:, None]).sum(axis=0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("n_kept", [0, 2, 3])
+def test_sum_of_images_of_lights(n_kept: int) -> None:
+    values, gains, n = colors(3, 2503, 3), colors(3, 3), 2503  # more than one chunk, and no whole number of vectors
+    still_pixel, still = np.arange(0, n, 7, dtype=np.int32), colors(len(range(0, n, 7)), 3, seed=5)
+    expected = (values.astype(np.float64) * gains[:, None]).sum(axis=0)
+    expected[still_pixel] += still
+    kept = np.empty((n if n_kept else 0, 3), np.float32)
+    sum_scaled(values[:n_kept], gains[:n_kept], kept)
+    out = np.full((n, 3), np.nan, np.float32)
+    sum_films((kept, values[n_kept:], np.tile(gains[n_kept:], (1, 16))), still_pixel, still, out)
+    np.testing.assert_allclose(out, expected, rtol=1e-6)
 
 
 def test_what_is_kept_of_direct_light_does_not_show_in_the_bits() -> None:
