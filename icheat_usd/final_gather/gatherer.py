@@ -12,11 +12,12 @@ from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import OffsetCasters
 from icheat_usd.edits.pairs import PairLight, edited_light
 from icheat_usd.final_gather.hits import GatherRays, Reflected, reflected_radiance, trace_hemisphere, trace_specular
+from icheat_usd.final_gather.lobe_rays import LobeRays, trace_lobe
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import LightSampler
 from icheat_usd.materials import is_glossy, take_points
 from icheat_usd.samples import GatherSamples
-from icheat_usd.scene import F32, I64, Bool, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces
 
 
@@ -70,7 +71,7 @@ class Lobe(NamedTuple):
     """Rays of one lobe of some of the points, and the light that they bring."""
 
     where: I64  #: (m,) points that have the lobe
-    rays: GatherRays  #: (m * n_rays,)
+    rays: GatherRays | LobeRays  #: (m * n_rays,)
     light: Reflected
     tint: F32  #: (m, 3) reflectance outside the rays' throughput
     seed: int
@@ -127,8 +128,7 @@ def clamped_like(whole: F32, part: F32) -> F32:
 
 def relit(gatherer: Gatherer, lobe: Lobe) -> Lobe:
     """The same rays with the light that a gatherer finds at their ends."""
-    light = _reflected(gatherer, lobe.rays.ends, lobe.rays.throughput, int(hash_combine(lobe.seed, 11)))
-    return lobe._replace(light=light)
+    return lobe._replace(light=_brought(gatherer, lobe.rays, int(hash_combine(lobe.seed, 11))))
 
 
 def _under_stack(gatherer: Gatherer, points: SurfacePoints, lobes: list[Lobe], base: F32) -> F32:
@@ -158,23 +158,42 @@ def specular_lobe(
         return None
     own = int(hash_combine(seed, 7))
     shiny = take_points(points, glossy)
-    rays = trace_specular(g.snapshot, g.tracer, shiny, to_eye[glossy], draws[glossy], n_rays, own)
+    asked = to_eye[glossy], draws[glossy], n_rays, own
+    rays: GatherRays | LobeRays | None = None
+    if not g.follows_paths:
+        assert g.solution is not None
+        rays = trace_lobe(g.snapshot, g.tracer, g.solution.gather, shiny, *asked)
+    if rays is None:
+        rays = trace_specular(g.snapshot, g.tracer, shiny, *asked)
     return _lit(g, glossy, rays, np.ones((len(glossy), 3), np.float32), int(hash_combine(own, 2)))
 
 
-def _lit(gatherer: Gatherer, where: I64, rays: GatherRays, tint: F32, seed: int) -> Lobe:
-    return Lobe(where, rays, _reflected(gatherer, rays.ends, rays.throughput, int(hash_combine(seed, 11))), tint, seed)
+def _lit(gatherer: Gatherer, where: I64, rays: GatherRays | LobeRays, tint: F32, seed: int) -> Lobe:
+    return Lobe(where, rays, _brought(gatherer, rays, int(hash_combine(seed, 11))), tint, seed)
+
+
+def _brought(gatherer: Gatherer, rays: GatherRays | LobeRays, seed: int) -> Reflected:
+    """Light that rays bring."""
+    if isinstance(rays, LobeRays) or not gatherer.follows_paths:
+        assert gatherer.solution is not None
+        return _sent(gatherer.solution, rays.cells(gatherer.solution.gather), rays.throughput)
+    return _reflected(gatherer, rays.ends, rays.throughput, seed)
+
+
+def _sent(solution: GatherSolution, cell: I32, throughput: F32) -> Reflected:
+    """Light that cells send along rays with some throughput."""
+    if solution.sent is not None:
+        by_group = np.take(solution.sent, cell, axis=1) * throughput
+        return Reflected(by_group.sum(axis=0), by_group)
+    by_group = np.take(solution.b, cell, axis=1) * throughput
+    return Reflected(np.take(solution.total, cell, axis=0) * throughput, by_group)
 
 
 def _reflected(gatherer: Gatherer, points: SurfacePoints, throughput: F32, seed: int) -> Reflected:
+    """Light that points, the ends of rays with some throughput, reflect."""
     if not gatherer.follows_paths:
         assert gatherer.solution is not None
-        cell = gatherer.solution.gather.locate(points)
-        if gatherer.solution.sent is not None:
-            by_group = np.take(gatherer.solution.sent, cell, axis=1) * throughput
-            return Reflected(by_group.sum(axis=0), by_group)
-        by_group = np.take(gatherer.solution.b, cell, axis=1) * throughput
-        return Reflected(np.take(gatherer.solution.total, cell, axis=0) * throughput, by_group)
+        return _sent(gatherer.solution, gatherer.solution.gather.locate(points), throughput)
     return reflected_radiance(
         gatherer.snapshot,
         gatherer.tracer,
@@ -215,11 +234,12 @@ def light_of_pairs(
         if len(some) == 0:
             continue
         arrived = np.take(lobe.light.by_group, some, axis=1), np.take(lobe.rays.throughput, some, axis=0)
-        blocks.append(_pairs(gatherer, lobe, some, owner[some], take_points(lobe.rays.ends, some), *arrived))
+        casters = lobe.rays.ends_of(gatherer.snapshot, some)
+        blocks.append(_pairs(gatherer, lobe, some, owner[some], casters, *arrived))
         for slot, edit in enumerate(gatherer.field.throughs):
             reached: Bool = np.asarray((receivers.masks[gatherer.field.rows_of(edit)] > 0).any(axis=0), np.bool_)
             hidden = gatherer.field.edits[edit].occluders
-            held = some[reached[owner[some]] & hidden[lobe.rays.ends.instance[some]]]
+            held = some[reached[owner[some]] & hidden[casters.instance]]
             if len(held):
                 blocks.append(_held_back(gatherer, lobe, held, owner[held], slot))
     offsets = None if gatherer.solution is None or not with_offsets else gatherer.solution.offsets

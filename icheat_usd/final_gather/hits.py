@@ -12,7 +12,8 @@ from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.samples import cosine_rays
 from icheat_usd.lighting import LightSampler, irradiance
 from icheat_usd.materials import effective_albedo, nonzero_rows, sample_specular, take_points
-from icheat_usd.scene import F32, I64, Bool, SceneSnapshot, SurfacePoints
+from icheat_usd.samples import GatherSamples
+from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 from icheat_usd.transport import sum_groups
 
@@ -28,6 +29,14 @@ class GatherRays(NamedTuple):
     directions: F32  #: (n, 3)
     seed: int  #: of the choices at delta vertices, for `first_surfaces`
     reflectance: F32 | None = None  #: (n, 3) the lobe's share of `throughput`; None is 1
+
+    def ends_of(self, snapshot: SceneSnapshot, some: I64) -> SurfacePoints:
+        """Surfaces that some of the rays end on."""
+        return take_points(self.ends, some)
+
+    def cells(self, gather: GatherSamples) -> I32:
+        """Gather cells that the rays end in; -1 for none."""
+        return gather.locate(self.ends)
 
 
 def trace_hemisphere(

@@ -154,6 +154,27 @@ def visible_normal(to_eye: Vector, alpha: float, u: float, v: float) -> Vector:
     return normalized((alpha * h[0], alpha * h[1], max(0.0, h[2])))
 
 
+@kernel
+def sample_lobe(points: tuple, i: int, eye: Vector, u: float, v: float) -> tuple[Vector, float, float]:
+    """A direction of the GGX lobe of point i, seen from the unit vector `eye`; weights as of `sample_specular`."""
+    normal = row3(points.shading_normal, i)
+    if points.instance[i] < 0 or not has_lobe(points, i):
+        return normal, 0.0, 0.0
+    alpha = lobe_alpha(points.roughness[i])
+    tangent, bitangent = frame(normal)
+    local = normalized((dot(eye, tangent), dot(eye, bitangent), max(dot(eye, normal), 1e-4)))
+    h = visible_normal(local, alpha, u, v)
+    cosine = dot(local, h)
+    light = plus_scaled(scaled(h, 2.0 * cosine), local, -1.0)
+    world = normalized(plus_scaled(plus_scaled(scaled(tangent, light[0]), bitangent, light[1]), normal, light[2]))
+    if light[2] <= 0.0 or dot(row3(points.normal, i), world) <= 0.0:
+        return world, 0.0, 0.0
+    eye_lambda = smith_lambda(local[2], alpha)
+    weight = (1.0 + eye_lambda) / (1.0 + eye_lambda + smith_lambda(light[2], alpha))
+    share = schlick_weight(cosine)
+    return world, weight * (1.0 - share), weight * share
+
+
 @parallel_kernel
 def sample_specular(
     points: tuple, to_eye: np.ndarray, u: np.ndarray, directions: np.ndarray, base: np.ndarray, edge: np.ndarray
@@ -162,30 +183,8 @@ def sample_specular(
     n = points.instance.shape[0]
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            normal, geometric = row3(points.shading_normal, i), row3(points.normal, i)
-            eye = normalized(row3(to_eye, i))
-            base[i] = 0.0
-            edge[i] = 0.0
-            store3(directions, i, normal)
-            if points.instance[i] < 0 or not has_lobe(points, i):
-                continue
-            alpha = lobe_alpha(points.roughness[i])
-            tangent, bitangent = frame(normal)
-            local = normalized((dot(eye, tangent), dot(eye, bitangent), max(dot(eye, normal), 1e-4)))
-            h = visible_normal(local, alpha, u[i, 0], u[i, 1])
-            cosine = dot(local, h)
-            light = plus_scaled(scaled(h, 2.0 * cosine), local, -1.0)
-            world = normalized(
-                plus_scaled(plus_scaled(scaled(tangent, light[0]), bitangent, light[1]), normal, light[2])
-            )
+            world, base[i], edge[i] = sample_lobe(points, i, normalized(row3(to_eye, i)), u[i, 0], u[i, 1])
             store3(directions, i, world)
-            if light[2] <= 0.0 or dot(geometric, world) <= 0.0:
-                continue
-            eye_lambda = smith_lambda(local[2], alpha)
-            weight = (1.0 + eye_lambda) / (1.0 + eye_lambda + smith_lambda(light[2], alpha))
-            share = schlick_weight(cosine)
-            base[i] = weight * (1.0 - share)
-            edge[i] = weight * share
 
 
 @kernel

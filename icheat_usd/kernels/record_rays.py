@@ -60,6 +60,29 @@ def stratum_direction(sx, sy, sz, seed, stream, j, k, n_theta, n_phi):  # type: 
 
 
 @kernel
+def cell_of_hit(  # type: ignore[no-untyped-def]
+    cells, locator, points, to_world, to_object, triangle_route, i, t, u, v, dx, dy, dz, stack, bound
+):
+    """Gather cell that a ray along (dx, dy, dz) ends in on triangle t of instance i: `NOTHING` or `DETOUR` if none."""
+    if triangle_route[t] != 0:
+        return np.int32(DETOUR)
+    plane = plane_of(points, to_object, i, t)
+    if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
+        return np.int32(NOTHING)
+    side = side_seen(plane, dx, dy, dz)
+    found = entry_at(cells.place, cells.face, cells.square, i, t, side, u, v)
+    if found < 0:
+        px, py, pz = place_on(points, to_world, i, t, u, v)
+        nx, ny, nz = unit_normal(plane, side)
+        if found == WALK:
+            found = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
+        else:
+            detour = locator.slot_detour[locator.slot[2 * i + side]]
+            found = nearest_listed(cells.candidates, locator.sample, found, detour, px, py, pz, nx, ny, nz)
+    return np.int32(found)
+
+
+@kernel
 def _trace_hemisphere(  # type: ignore[no-untyped-def]
     r,
     trace,
@@ -85,8 +108,6 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
 ):
     """Row r of `trace_hemispheres`."""
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
-    place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
-    sample, slot, slot_detour = locator.sample, locator.slot, locator.slot_detour
     stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
     storage = np.zeros(24 * 16 + 16 + 64, np.float32)
     shift = np.int64((-storage.ctypes.data % 64) // 4)
@@ -133,23 +154,10 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
                 out_uv[r, column, 0] = u
                 out_uv[r, column, 1] = v
                 out_distance[r, column] = rays[8, e]
-                if triangle_route[t] != 0:
-                    out_cell[r, column] = DETOUR
-                    continue
-                plane = plane_of(points, to_object, i, t)
-                if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
-                    continue
-                side = side_seen(plane, rays[4, e], rays[5, e], rays[6, e])
-                found = entry_at(place, face, square, i, t, side, u, v)
-                if found < 0:
-                    px, py, pz = place_on(points, to_world, i, t, u, v)
-                    nx, ny, nz = unit_normal(plane, side)
-                    if found == WALK:
-                        found = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
-                    else:
-                        detour = slot_detour[slot[2 * i + side]]
-                        found = nearest_listed(candidates, sample, found, detour, px, py, pz, nx, ny, nz)
-                out_cell[r, column] = found
+                dx, dy, dz = rays[4, e], rays[5, e], rays[6, e]
+                out_cell[r, column] = cell_of_hit(
+                    cells, locator, points, to_world, to_object, triangle_route, i, t, u, v, dx, dy, dz, stack, bound
+                )
 
 
 @parallel_kernel

@@ -8,7 +8,7 @@ from numba import prange
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.bsdf import dielectric_reflectance, interface, mirror_share, reflected
 from icheat_usd.kernels.random import hash_combine, uniform
-from icheat_usd.kernels.vector import dot, normalized, plus_scaled, row3, store3, transform_point
+from icheat_usd.kernels.vector import Vector, dot, normalized, plus_scaled, row3, store3, transform_point
 
 CHUNK = 512
 # Offsets are 2^-18 of the largest coordinate involved, 32 units in the last place of float32; 2 were seen to be enough
@@ -41,6 +41,14 @@ def point_magnitudes(geometry: tuple, instance: np.ndarray, triangle: np.ndarray
                 out[i] = triangle_magnitude(geometry, np.int64(instance[i]), np.int64(triangle[i]))
 
 
+@kernel
+def offset_origin(position: Vector, normal: Vector, direction: Vector, magnitude: float) -> Vector:
+    """A position moved along the normal to the side that `direction` leaves on."""
+    size = max(abs(position[0]), abs(position[1]), abs(position[2]), magnitude)
+    sign = 1.0 if dot(normal, direction) >= 0.0 else -1.0
+    return plus_scaled(position, normal, sign * RELATIVE_OFFSET * size)
+
+
 @parallel_kernel
 def offset_origins(
     positions: np.ndarray, normals: np.ndarray, directions: np.ndarray, magnitude: np.ndarray, out: np.ndarray
@@ -49,10 +57,8 @@ def offset_origins(
     n = positions.shape[0]
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            p, normal = row3(positions, i), row3(normals, i)
-            size = max(abs(p[0]), abs(p[1]), abs(p[2]), np.float64(magnitude[min(i, magnitude.shape[0] - 1)]))
-            sign = 1.0 if dot(normal, row3(directions, i)) >= 0.0 else -1.0
-            store3(out, i, plus_scaled(p, normal, sign * RELATIVE_OFFSET * size))
+            size = np.float64(magnitude[min(i, magnitude.shape[0] - 1)])
+            store3(out, i, offset_origin(row3(positions, i), row3(normals, i), row3(directions, i), size))
 
 
 @parallel_kernel

@@ -1,0 +1,169 @@
+"""Rays of specular lobes: made from their points, and each traced to the gather cell that it ends in."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.bsdf import sample_lobe
+from icheat_usd.kernels.gather_rows import NOTHING, trace_16
+from icheat_usd.kernels.random import hash_combine, sobol_pair
+from icheat_usd.kernels.record_rays import cell_of_hit
+from icheat_usd.kernels.tracing import offset_origin
+from icheat_usd.kernels.vector import normalized, row3, store3
+
+_INVALID = np.uint32(0xFFFFFFFF)
+_RAYS_AT_ONCE = 1024  # that a thread takes: a multiple of a packet's 16
+
+
+@parallel_kernel
+def fill_lobe_rays(points, magnitude, to_eye, draws, n_rays, seed, origins, directions, reflectance):  # type: ignore[no-untyped-def]
+    """`n_rays` rays of the lobe of each of n points, one point after another.
+
+    Parameters
+    ----------
+    points : SurfacePoints of n points
+    magnitude : (n,) float32, metres
+        As of `offset_origin`.
+    to_eye : (n, 3) float32
+    draws : (n, 2) int64
+        Sequence of each point, and its number among those that share it.
+    seed : int, unsigned, 32 bits
+    origins, directions, reflectance : (n n_rays, 3) float32
+        Written: starts off the surface, unit directions, and what the lobe reflects from there over the density of
+        asking; 0 below the horizon.
+    """
+    for i in prange(len(draws)):
+        sequence = hash_combine(hash_combine(seed, 0x12), draws[i, 0])
+        eye = normalized(row3(to_eye, i))
+        position, normal, size = row3(points.position, i), row3(points.normal, i), np.float64(magnitude[i])
+        for k in range(n_rays):
+            u, v = sobol_pair(draws[i, 1] * n_rays + k, sequence)
+            world, base, edge = sample_lobe(points, i, eye, u, v)
+            row = i * n_rays + k
+            store3(directions, row, world)
+            store3(origins, row, offset_origin(position, normal, row3(directions, row), size))
+            for c in range(3):
+                reflectance[row, c] = (
+                    np.float32(base) * points.specular[i, c] + np.float32(edge) * points.specular_edge[i, c]
+                )
+
+
+@kernel
+def _trace_some(  # type: ignore[no-untyped-def]
+    first,
+    last,
+    trace,
+    cells,
+    locator,
+    depth,
+    points,
+    to_world,
+    to_object,
+    triangle_route,
+    origins,
+    directions,
+    weight,
+    out_cell,
+    out_hits,
+):
+    """Rays `first` to `last` of `trace_to_cells`."""
+    mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
+    stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
+    storage = np.zeros(24 * 16 + 16 + 64, np.float32)
+    shift = np.int64((-storage.ctypes.data % 64) // 4)
+    valid = storage[shift : shift + 16].view(np.int32)
+    rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
+    words = rays.view(np.uint32)
+    single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
+    single_words = single.view(np.uint32)
+    rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
+    for begin in range(first, last, 16):
+        n = min(16, last - begin)
+        for e in range(16):
+            r = begin + min(e, n - 1)
+            is_lit = weight[r, 0] > 0.0 or weight[r, 1] > 0.0 or weight[r, 2] > 0.0
+            valid[e] = -1 if e < n and is_lit else 0
+            for c in range(3):
+                rays[c, e] = origins[r, c]
+                rays[4 + c, e] = directions[r, c]
+        rays[3, :] = 0.0
+        rays[7, :] = 0.0
+        rays[8, :] = np.inf
+        words[9, :] = _INVALID
+        words[10, :] = 0
+        words[11, :] = 0
+        words[17:21, :] = _INVALID
+        trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
+        for e in range(n):
+            r = begin + e
+            out_cell[r] = NOTHING
+            out_hits.distance[r] = np.inf
+            out_hits.instance[r] = -1
+            out_hits.triangle[r] = -1
+            out_hits.u[r] = 0.0
+            out_hits.v[r] = 0.0
+            if valid[e] == 0 or words[18, e] == _INVALID:
+                continue
+            i = np.int64(words[18, e] if words[19, e] == _INVALID else words[19, e])
+            t = mesh_begin[instance_mesh[i]] + np.int64(words[17, e])
+            u, v = rays[15, e], rays[16, e]
+            out_hits.distance[r] = rays[8, e]
+            out_hits.instance[r] = i
+            out_hits.triangle[r] = t
+            out_hits.u[r] = u
+            out_hits.v[r] = v
+            dx, dy, dz = rays[4, e], rays[5, e], rays[6, e]
+            out_cell[r] = cell_of_hit(
+                cells, locator, points, to_world, to_object, triangle_route, i, t, u, v, dx, dy, dz, stack, bound
+            )
+
+
+@parallel_kernel
+def trace_to_cells(  # type: ignore[no-untyped-def]
+    trace,
+    cells,
+    locator,
+    depth,
+    points,
+    to_world,
+    to_object,
+    triangle_route,
+    origins,
+    directions,
+    weight,
+    out_cell,
+    out_hits,
+):
+    """Gather cell and first surface of n rays; those without weight are not traced.
+
+    Parameters
+    ----------
+    trace, cells, locator, depth, points, to_world, to_object, triangle_route
+        As of `record_rays.trace_hemispheres`.
+    origins, directions, weight : (n, 3) float32
+    out_cell : (n,) int32
+        A cell, `NOTHING` or `DETOUR`.
+    out_hits : Hits of n rays
+        The first surface; instance -1 where there is none.
+    """
+    n = len(origins)
+    for chunk in prange((n + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE):
+        _trace_some(
+            chunk * _RAYS_AT_ONCE,
+            min(n, (chunk + 1) * _RAYS_AT_ONCE),
+            trace,
+            cells,
+            locator,
+            depth,
+            points,
+            to_world,
+            to_object,
+            triangle_route,
+            origins,
+            directions,
+            weight,
+            out_cell,
+            out_hits,
+        )
