@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from icheat_usd.errors import EditError, IcheatError
+from icheat_usd.kernels.assemble import sum_films
 from icheat_usd.session import Quality, Session
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_events import Level, LiveEvent
 from tests.session.test_session import ROOM
 
 QUALITY = Quality(n_gather=192, rays_per_row=16, rays_per_bounce_row=16, light_samples=2, n_bounces=3)
+PACKED = replace(QUALITY, record_error=0.05, record_rays=64, packing_error=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +89,27 @@ def test_a_script_tries_amounts_and_each_is_the_edit_at_that_amount(live: LiveSe
         live.set_amount("warm", amount)
         means.append(float((live.frame() - off).mean()))
     assert means[1] == pytest.approx(2 * means[0], rel=1e-3) and means[0] > 0.001
+
+
+@pytest.mark.parametrize("module", ["light_films", "amount_films"])
+def test_gains_and_amounts_at_rest_are_sums_of_images(
+    stage: Path, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also though a session sets its stack again whatever has changed, and refines between the commands."""
+    sums: list[object] = []
+    of, name = f"icheat_usd.relight.{module}.sum_films", module.partition("_")[0]
+    monkeypatch.setattr(of, lambda *values: (sums.append(values), sum_films(*values)))
+    with LiveSession.open(stage, width=20, height=15, quality=PACKED) as live:
+        live.wait("rest")
+        for k in range(5):
+            if name == "light":
+                live.set_light("Lamp", gain=0.5 + 0.1 * k)
+            else:
+                live.set_amount("dim", 0.5 + 0.1 * k)
+            found, n = live.frame(), len(sums)
+        live.wait("rest")
+        np.testing.assert_allclose(found, live.frame(), rtol=1e-3, atol=1e-4)
+    assert n >= (5 if name == "light" else 2)
 
 
 def test_film_has_the_layers_of_a_relight_and_the_same_image(live: LiveSession) -> None:
