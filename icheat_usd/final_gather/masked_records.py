@@ -25,14 +25,15 @@ from icheat_usd.final_gather.slot_choices import Slots, in_turn, slot_choices
 from icheat_usd.kernels import painted_sums, stack_sums
 from icheat_usd.kernels import record_slots as kernels
 from icheat_usd.kernels.mask_table import MaskTable
+from icheat_usd.kernels.record_lanes import LANES, frames_of
 from icheat_usd.scene import F32, I64, Bool, SurfacePoints
 
 
 class _Values(NamedTuple):
     """Changes of records' light for the masks of slots."""
 
-    light: F32  #: (n, N_VALUES, 4)
-    derivative: F32  #: (n_derivatives, N_VALUES, 4)
+    light: F32  #: (n, LANES)
+    derivative: F32  #: (n_derivatives, LANES)
 
 
 class MaskedRecords:
@@ -63,7 +64,9 @@ class MaskedRecords:
         self._of_few, self._others = _ways(table)
         self._weights = painted_weights(table, self._others, steepness(full, self._field))
         self._choices = slot_choices(self._field, bend, hemispheres)
-        nothing = np.empty((0, stack_sums.N_VALUES, 4), np.float32)
+        self._frames = np.empty((cache.n, LANES), np.float32)
+        frames_of(cache.table.position, cache.table.normal, hemispheres.shrink, self._frames)
+        nothing = np.empty((0, LANES), np.float32)
         self._values = _Values(nothing, nothing)
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
@@ -77,7 +80,7 @@ class MaskedRecords:
         -------
         (m, 3) float32
         """
-        cache, where, which = self._cache, receivers.where, receivers.which
+        where, which = receivers.where, receivers.which
         choices, out = self._choices, np.zeros((len(where), 3), np.float32)
         if not choices.patterns.acts.any():
             return out
@@ -88,8 +91,7 @@ class MaskedRecords:
         self._know(choices.slots)
         soft_begin, soft_row = choices.patterns.soft_rows()
         kernels.mix_slots(
-            cache.table.position,
-            cache.table.normal,
+            self._frames,
             *self._values,
             choices.slots.derived,
             choices.slots.masks,
@@ -115,7 +117,7 @@ class MaskedRecords:
         nowhere = np.full((1, self._field.n_rows), -1, np.int16)
         begin = np.searchsorted(row, np.arange(rays.n + 1))
         slots = stack_sums.SlotTable(begin, masks, np.zeros(n, np.int32), nowhere, np.zeros(n + 1, np.int64))
-        return np.ascontiguousarray(self._evaluate(rays, row, slots).light[:, 0, :3])
+        return np.ascontiguousarray(self._evaluate(rays, row, slots).light[:, 0:15:5])
 
     def _know(self, upto: Slots) -> None:
         """See to it that the light of some slots is known."""
@@ -130,9 +132,9 @@ class MaskedRecords:
         self._values = _Values(*(np.concatenate(pair) for pair in zip(self._values, found, strict=True)))
 
     def _evaluate(self, of: Hemispheres, record: I64, slots: stack_sums.SlotTable) -> _Values:
-        """Changes of light, (n_slots, N_VALUES, 4), and derivatives, (n_derivatives, N_VALUES, 4)."""
-        values = np.zeros((len(record), stack_sums.N_VALUES, 4), np.float32)
-        derivative = np.zeros((int(slots.derived[-1]), stack_sums.N_VALUES, 4), np.float32)
+        """Changes of light, (n_slots, LANES), and derivatives, (n_derivatives, LANES)."""
+        values = np.zeros((len(record), LANES), np.float32)
+        derivative = np.zeros((int(slots.derived[-1]), LANES), np.float32)
         wanted = np.diff(slots.begin) > 0
         # Rays of all are looked through once; other bands of the image will ask for the rest.
         likely = self._choices.likely() if of is self._hemispheres else wanted
@@ -166,9 +168,6 @@ class MaskedRecords:
                     values,
                     derivative,
                 )
-        shrink = np.take(of.shrink, record)
-        values[:, 4:] *= shrink[:, None, None]
-        derivative[:, 4:] *= np.repeat(shrink, np.diff(slots.derived))[:, None, None]
         return _Values(values, derivative)
 
 

@@ -17,9 +17,10 @@ from icheat_usd.final_gather.gatherer import GatherSolution
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.record_rays import RecordRays
 from icheat_usd.kernels import merged_rays as kernels
-from icheat_usd.kernels.caster_sums import N_VALUES, RayTable
+from icheat_usd.kernels.caster_sums import RayTable
 from icheat_usd.kernels.mask_patches import MaskPatches
 from icheat_usd.kernels.mask_table import MaskTable
+from icheat_usd.kernels.record_lanes import LANES
 from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot
 
 #: Difference in the change of light, by all masks of a caster together, from which on rays are kept apart.
@@ -94,7 +95,7 @@ class LightTable(NamedTuple):
 class _Rows(NamedTuple):
     caster: I32  #: (m,)
     weights: F32  #: (m, width) of the caster's masks
-    light: F32  #: (m, n_blocks, N_VALUES, 4)
+    light: F32  #: (m, n_blocks, LANES)
 
 
 class MergedLight:
@@ -166,7 +167,7 @@ class MergedLight:
         self._is_kept |= table.has
 
     def _row_bytes(self) -> int:
-        return 4 * (1 + self._width + self._sent.shape[1] * N_VALUES * 4)
+        return 4 * (1 + self._width + self._sent.shape[1] * LANES)
 
     def _rays_at_once(self) -> int:
         """Of a table, by what was left of those before."""
@@ -205,7 +206,7 @@ class MergedLight:
         return LightTable(has, np.searchsorted(of_row[entry], np.arange(of.n + 1)), entry, rows)
 
     def _no_rows(self, n: int) -> _Rows:
-        shape = (n, self._sent.shape[1], N_VALUES, 4)
+        shape = (n, self._sent.shape[1], LANES)
         return _Rows(np.empty(n, np.int32), np.empty((n, self._width), np.float32), np.empty(shape, np.float32))
 
     def _merged(
@@ -256,7 +257,7 @@ class MergedLight:
 
     def _scratch(self, n: int, room: int, before: dict[int, F32]) -> _Rows:
         """Rows for n records: new memory would take as long as the rays."""
-        shapes = ((n, room), (n, room, self._width), (n, room, self._sent.shape[1], N_VALUES, 4))
+        shapes = ((n, room), (n, room, self._width), (n, room, self._sent.shape[1], LANES))
         for number, shape in enumerate(shapes):
             if number not in before or before[number].size < np.prod(shape):
                 before[number] = np.empty(int(np.prod(shape)), np.float32)

@@ -15,6 +15,7 @@ from icheat_usd.final_gather.record_rays import RecordRays
 from icheat_usd.kernels import painted_sums as kernels
 from icheat_usd.kernels.caster_sums import RayTable, list_casters
 from icheat_usd.kernels.mask_table import MaskTable
+from icheat_usd.kernels.record_lanes import LANES
 from icheat_usd.scene import F32, I32, I64, Bool, Geometry
 
 #: Stacks of masks whose light is kept for others.
@@ -27,7 +28,7 @@ class _Entries(NamedTuple):
     record: I64  #: (m,) ascending
     caster: I32  #: (m,)
     first: I64  #: (m + 1,) sums of each
-    values: F32  #: (n_sums, n_blocks, N_VALUES, 4)
+    values: F32  #: (n_sums, n_blocks, LANES)
 
 
 def is_painted(casters: MaskTable) -> Bool:
@@ -66,7 +67,7 @@ class LightByMasks:
     def __init__(self, sent: F32, painted: MaskTable, selected: Bool, least: int, n: int) -> None:
         self._sent, self._painted, self._selected, self._least = sent, painted, selected, least
         self._is_known = np.zeros(n, np.bool_)
-        empty = np.empty((0, sent.shape[1], kernels.N_VALUES, 4), np.float32)
+        empty = np.empty((0, sent.shape[1], LANES), np.float32)
         self.entries = _Entries(np.empty(0, np.int64), np.empty(0, np.int32), np.zeros(1, np.int64), empty)
         self.begin = np.zeros(n + 1, np.int64)  #: entries of each record
 

@@ -9,20 +9,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.simd import (
-    add_outer,
-    address_of,
-    load,
-    load_color,
-    scale_add,
-    scaled,
-    store,
-    store_color,
-    store_fours,
-)
+from icheat_usd.kernels.simd import address_of, load, store_fours
 
-#: Irradiance, its change with ``normal x other normal`` and with place: colours of a record's light.
-N_VALUES = 7
 _TOUCHING = np.float32(1e-6)  # metres: a ray may end where it starts, in a crease
 
 
@@ -116,23 +104,6 @@ def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: 
 def room_of_weights(n_rays):  # type: ignore[no-untyped-def]
     """Rows that `ray_weights` needs for so many rays."""
     return -(-n_rays // 16) * 16
-
-
-@kernel
-def add_weighted(to, light, share, weights_0, ray):  # type: ignore[no-untyped-def]
-    """Add a ray's light to five sums at an address: as it is, and times its four of the `ray_weights` at another."""
-    store_color(to, scale_add(light, share, load_color(to)))
-    store(to + 16, add_outer(load_color(weights_0 + 16 * ray), light, load(to + 16)))
-
-
-@kernel
-def turn_to_world(at, tangent, other):  # type: ignore[no-untyped-def]
-    """Values (N_VALUES, 4) of a record at an address, from the five sums (5, 4) about its tangents that are there."""
-    turn_a, turn_b = load_color(at + 16), load_color(at + 32)
-    move_a, move_b = load_color(at + 48), load_color(at + 64)
-    for c in range(3):
-        store_color(at + 16 + 16 * c, scale_add(turn_b, other[c], scaled(turn_a, tangent[c])))
-        store_color(at + 64 + 16 * c, scale_add(move_b, other[c], scaled(move_a, tangent[c])))
 
 
 @parallel_kernel

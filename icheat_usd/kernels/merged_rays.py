@@ -11,10 +11,10 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import N_VALUES, add_weighted, ray_weights, room_of_weights, turn_to_world
+from icheat_usd.kernels.caster_sums import ray_weights, room_of_weights
 from icheat_usd.kernels.mask_sheets import add_weights_in_sheet
+from icheat_usd.kernels.record_lanes import LANES, add_ray
 from icheat_usd.kernels.record_rays import turn_of
-from icheat_usd.kernels.samples import basis
 from icheat_usd.kernels.simd import address_of, black, color_product, load_color, load_rgb, store_color
 from icheat_usd.kernels.texels import corner_texels
 
@@ -69,7 +69,7 @@ def merge_rays(  # type: ignore[no-untyped-def]
     caster : (n_groups, room) int32, out
     weights : (n_groups, room, width) float32, out
         Mean of the sheets' columns.
-    light : (n_groups, room, n_blocks, N_VALUES, 4) float32, out
+    light : (n_groups, room, n_blocks, LANES) float32, out
     """
     for g in prange(len(record)):
         number[g] = _merge(
@@ -129,6 +129,7 @@ def _merge(  # type: ignore[no-untyped-def]
     weights,
     light,
 ):
+    room = rays.cell.shape[1] * (end - first)
     n, n_seen = _take_together(
         order,
         first,
@@ -141,6 +142,7 @@ def _merge(  # type: ignore[no-untyped-def]
         selected,
         sheets,
         patches,
+        room // _FEW if weights.shape[1] > 0 else room,
         seed,
         n_theta,
         n_phi,
@@ -161,6 +163,7 @@ def _merge(  # type: ignore[no-untyped-def]
             selected,
             sheets,
             plateaus,
+            room,
             seed,
             n_theta,
             n_phi,
@@ -184,6 +187,7 @@ def _take_together(  # type: ignore[no-untyped-def]
     selected,
     sheets,
     patches,
+    most,
     seed,
     n_theta,
     n_phi,
@@ -191,7 +195,7 @@ def _take_together(  # type: ignore[no-untyped-def]
     weights,
     light,
 ):
-    """How many are left of the rays of a record, and how many there are."""
+    """How many are left of a record's rays, and how many there are; it gives up when more than `most` are left."""
     width, n_rays, n_blocks, n_instances = weights.shape[1], rays.cell.shape[1], sent.shape[1], len(selected)
     room = n_rays * (end - first)
     ray_weight = np.empty((room_of_weights(n_rays), 4), np.float32)
@@ -251,9 +255,11 @@ def _take_together(  # type: ignore[no-untyped-def]
                 # Rays without a patch are kept apart.
                 place = _place(own_key, key) if own_key >= 0 else np.int64(-1)
                 if place < 0 or key[place] < 0:
+                    if n == most:
+                        return n + 1, n_seen
                     last = n
                     caster[n], bright[n] = i, np.float32(0.0)
-                    _blacken(light_0 + 16 * N_VALUES * n_blocks * n, N_VALUES * n_blocks)
+                    _blacken(light_0 + 4 * LANES * n_blocks * n, LANES // 4 * n_blocks)
                     _blacken(mean_0 + 4 * width * n, width // 4)
                     n += 1
                     if place >= 0:
@@ -281,16 +287,11 @@ def _take_together(  # type: ignore[no-untyped-def]
                 brought = load_color(sent_0 + 16 * (sender * n_blocks + block))
                 if is_adjusted and (is_detour or sent[sender, block, 3] >= np.float32(0.0)):
                     brought = color_product(brought, load_rgb(throughput_0 + 12 * (a - 1)))
-                add_weighted(light_0 + 16 * N_VALUES * (last * n_blocks + block), brought, share, weight_0, ray)
-    # All of a record stand at one place.
-    r = order[first]
-    x, y, z, bx, by, bz = basis(rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2])
+                add_ray(light_0 + 4 * LANES * (last * n_blocks + block), brought, share, weight_0, ray)
     for e in range(n):
         if bright[e] > np.float32(0.0):
             for c in range(width):
                 weights[e, c] /= bright[e]
-    for q in range(n * n_blocks):
-        turn_to_world(light_0 + 16 * N_VALUES * q, (x, y, z), (bx, by, bz))
     return n, n_seen
 
 

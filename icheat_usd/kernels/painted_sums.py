@@ -11,18 +11,10 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import N_VALUES, add_weighted, ray_weights, room_of_weights, turn_to_world
+from icheat_usd.kernels.caster_sums import ray_weights, room_of_weights
+from icheat_usd.kernels.record_lanes import LANES, add_change, add_ray
 from icheat_usd.kernels.record_rays import turn_of
-from icheat_usd.kernels.samples import basis
-from icheat_usd.kernels.simd import (
-    address_of,
-    color_add,
-    color_product,
-    load_color,
-    load_rgb,
-    scaled,
-    store_color,
-)
+from icheat_usd.kernels.simd import address_of, color_product, load_color, load_rgb, scaled
 from icheat_usd.kernels.texels import corner_texels, texel_weight
 
 #: Painted masks on one caster; with more, there are more subsets than it takes to look at the rays again.
@@ -53,7 +45,7 @@ def painted_sums(  # type: ignore[no-untyped-def]
         Painted masks on each caster, no more than `MOST_PAINTED`, and nothing else.
     least : int
         1 to leave out the light itself, which no edit asks for that is painted.
-    out : (n_sums, n_blocks, N_VALUES, 4) float32, out, zero before
+    out : (n_sums, n_blocks, LANES) float32, out, zero before
     """
     for r in prange(len(begin) - 1):
         if begin[r] < begin[r + 1]:
@@ -105,7 +97,7 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
     weights = np.empty((room_of_weights(n_rays), 4), np.float32)
     ray_weights(rays.distance, r, first_turn, n_theta, n_phi, factor, weights)
     sent_0, throughput_0 = address_of(sent), address_of(rays.throughput)
-    out_0 = address_of(out) + 16 * N_VALUES * n_blocks * first[begin]
+    out_0 = address_of(out) + 4 * LANES * n_blocks * first[begin]
     weights_0 = address_of(weights)
     share = np.float32(np.pi / n_rays * factor)
     adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
@@ -153,11 +145,8 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
                 light = color_product(light, load_rgb(throughput_0 + 12 * (adjusted - 1)))
             for subset in range(least, n):
                 if product[subset] != np.float32(0.0):
-                    to = out_0 + 16 * N_VALUES * ((base + subset) * n_blocks + block)
-                    add_weighted(to, scaled(light, product[subset]), share, weights_0, ray)
-    x, y, z, bx, by, bz = basis(rays.shading_normal[r, 0], rays.shading_normal[r, 1], rays.shading_normal[r, 2])
-    for q in range((first[end] - first[begin]) * n_blocks):
-        turn_to_world(out_0 + 16 * N_VALUES * q, (x, y, z), (bx, by, bz))
+                    to = out_0 + 4 * LANES * ((base + subset) * n_blocks + block)
+                    add_ray(to, scaled(light, product[subset]), share, weights_0, ray)
 
 
 @parallel_kernel
@@ -167,14 +156,14 @@ def stack_of_painted(begin, caster, first, light, bit, casters, stack, slots, re
     Parameters
     ----------
     begin : (n_records + 1,) int64, caster : (m,) int32, first : (m + 1,) int64
-    light : (n_sums, n_blocks, N_VALUES, 4) float32
+    light : (n_sums, n_blocks, LANES) float32
         As of `painted_sums`, by record.
     bit : (n_entries,) int64
         Of each entry of `casters` in the numbers of subsets, -1 where it is not painted.
     casters, stack, slots : MaskTable, StackTable, SlotTable
     records : (k,) int64
         Records with slots.
-    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, N_VALUES, 4) float32, out, zero before
+    values : (n_slots, LANES), derivative : (n_derivatives, LANES) float32, out, zero before
     """
     for g in prange(len(records)):
         _of_painted(records[g], begin, caster, first, light, bit, casters, stack, slots, values, derivative)
@@ -190,13 +179,11 @@ def _of_painted(r, begin, caster, first, light, bit, casters, stack, slots, valu
         i, n = np.int64(caster[e]), first[e + 1] - first[e]
         for s in range(slots.begin[r], slots.begin[r + 1]):
             for block in range(n_blocks):
-                light_of_e = light_0 + 16 * N_VALUES * (first[e] * n_blocks + block)
+                light_of_e = light_0 + 4 * LANES * (first[e] * n_blocks + block)
                 _polynomial(i, s, block, -1, n, bit, casters, stack, slots, before, found)
                 for subset in range(n):
-                    change, at = load_color(found_0 + 32 * subset), light_of_e + 16 * N_VALUES * n_blocks * subset
-                    for v in range(N_VALUES):
-                        to = values_0 + 16 * (N_VALUES * s + v)
-                        store_color(to, color_add(change, load_color(at + 16 * v), load_color(to)))
+                    at = light_of_e + 4 * LANES * n_blocks * subset
+                    add_change(values_0 + 4 * LANES * s, load_color(found_0 + 32 * subset), at)
                 if slots.derived[s] == slots.derived[s + 1]:
                     continue
                 for k in range(casters.begin[i], casters.begin[i + 1]):
@@ -205,13 +192,10 @@ def _of_painted(r, begin, caster, first, light, bit, casters, stack, slots, valu
                     if place < 0:
                         continue
                     _polynomial(i, s, block, row, n, bit, casters, stack, slots, before, found)
-                    own = derivative_0 + 16 * N_VALUES * (slots.derived[s] + place)
+                    own = derivative_0 + 4 * LANES * (slots.derived[s] + place)
                     for subset in range(n):
-                        change = load_color(found_0 + 32 * subset + 16)
-                        at = light_of_e + 16 * N_VALUES * n_blocks * subset
-                        for v in range(N_VALUES):
-                            to = own + 16 * v
-                            store_color(to, color_add(change, load_color(at + 16 * v), load_color(to)))
+                        at = light_of_e + 4 * LANES * n_blocks * subset
+                        add_change(own, load_color(found_0 + 32 * subset + 16), at)
 
 
 @kernel

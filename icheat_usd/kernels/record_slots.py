@@ -10,19 +10,24 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import N_VALUES
+from icheat_usd.kernels.record_lanes import LANES
 from icheat_usd.kernels.simd import (
     address_of,
     black,
     color_add,
-    color_of,
     color_product,
     difference,
+    load,
     load_color,
+    multiply_add,
     plus_size,
-    scale_add,
+    product,
+    sixteen_of,
+    spread,
     store_color,
     store_rgb,
+    sum_of_fives,
+    zeros,
 )
 
 #: New slots of one record from one call, beyond which places take the nearest.
@@ -329,8 +334,7 @@ def _rows_in(k, masks, acts, out):  # type: ignore[no-untyped-def]
 
 @parallel_kernel
 def mix_slots(  # type: ignore[no-untyped-def]
-    at,
-    facing,
+    frame,
     values,
     derivative,
     derived,
@@ -354,7 +358,9 @@ def mix_slots(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, N_VALUES, 4) float32
+    frame : (n_records, 16) float32
+        As of `record_lanes.frames_of`.
+    values : (n_slots, LANES), derivative : (n_derivatives, LANES) float32
     derived : (n_slots + 1,) int64
         Derivatives of each slot, by the rows ``soft_row[soft_begin[p]:soft_begin[p + 1]]`` of its pattern p.
     slot : (n_pairs,) int64
@@ -368,8 +374,7 @@ def mix_slots(  # type: ignore[no-untyped-def]
         _mix_at(
             q,
             where[q],
-            at,
-            facing,
+            frame,
             values,
             derivative,
             derived,
@@ -394,8 +399,7 @@ def mix_slots(  # type: ignore[no-untyped-def]
 def _mix_at(  # type: ignore[no-untyped-def]
     q,
     p,
-    at,
-    facing,
+    frame,
     values,
     derivative,
     derived,
@@ -415,34 +419,28 @@ def _mix_at(  # type: ignore[no-untyped-def]
     out,
 ):
     values_0, derivative_0 = address_of(values), address_of(derivative)
-    zero = np.float32(0.0)
-    total = color_of(zero, zero, zero)
+    x, y, z = position[p, 0], position[p, 1], position[p, 2]
     nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
+    total = zeros()
     for k in range(count[p]):
-        r, s, w = record[p, k], slot[first + k], weight[p, k]
-        dx, dy, dz = position[p, 0] - at[r, 0], position[p, 1] - at[r, 1], position[p, 2] - at[r, 2]
-        mx, my, mz = facing[r, 0], facing[r, 1], facing[r, 2]
-        tx, ty, tz = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
-        own = values_0 + 16 * N_VALUES * s
-        total = scale_add(_at_place(own, tx, ty, tz, dx, dy, dz), w, total)
+        r, s = record[p, k], slot[first + k]
+        light = load(values_0 + 4 * LANES * s)
         if derived[s] < derived[s + 1]:
             pattern = slot_pattern[s]
+            by = derivative_0 + 4 * LANES * (derived[s] - soft_begin[pattern])
             for e in range(soft_begin[pattern], soft_begin[pattern + 1]):
                 row = soft_row[e]
                 step = masks[column, row] - slot_masks[s, row]
-                if step != zero:
-                    by = derivative_0 + 16 * N_VALUES * (derived[s] + e - soft_begin[pattern])
-                    total = scale_add(_at_place(by, tx, ty, tz, dx, dy, dz), w * step, total)
-    store_rgb(address_of(out) + 12 * q, total)
-
-
-@kernel
-def _at_place(values, tx, ty, tz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Light at a place from the values (N_VALUES, 4) at an address: turned by t and moved by d from the record."""
-    total = load_color(values)
-    total = scale_add(load_color(values + 16), tx, total)
-    total = scale_add(load_color(values + 32), ty, total)
-    total = scale_add(load_color(values + 48), tz, total)
-    total = scale_add(load_color(values + 64), dx, total)
-    total = scale_add(load_color(values + 80), dy, total)
-    return scale_add(load_color(values + 96), dz, total)
+                light = multiply_add(spread(step), load(by + 4 * LANES * e), light)
+        dx, dy, dz = x - frame[r, 0], y - frame[r, 1], z - frame[r, 2]
+        mx, my, mz = frame[r, 3], frame[r, 4], frame[r, 5]
+        cx, cy, cz = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
+        taken = sixteen_of(
+            np.float32(1.0),
+            cx * frame[r, 6] + cy * frame[r, 7] + cz * frame[r, 8],
+            cx * frame[r, 9] + cy * frame[r, 10] + cz * frame[r, 11],
+            frame[r, 12] * (dx * frame[r, 6] + dy * frame[r, 7] + dz * frame[r, 8]),
+            frame[r, 12] * (dx * frame[r, 9] + dy * frame[r, 10] + dz * frame[r, 11]),
+        )
+        total = multiply_add(product(light, taken), spread(weight[p, k]), total)
+    store_rgb(address_of(out) + 12 * q, sum_of_fives(total))

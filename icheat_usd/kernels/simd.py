@@ -334,18 +334,41 @@ def color_add(builder: Any, values: Any) -> Any:
     return _call(builder, "llvm.fmuladd.v4f32", _F4X, *values)
 
 
+_IN_FIVES = [0] * 5 + [1] * 5 + [2] * 5 + [3]  #: lanes: five of each channel, and the pad
+
+
 @_operation(floats, color)
-def four_times(builder: Any, values: Any) -> Any:
-    """A colour four times over."""
-    return _picked(builder, values[0], values[0], [0, 1, 2, 3] * 4)
+def spread_in_fives(builder: Any, values: Any) -> Any:
+    """Five times red, five times green, five times blue, and the pad."""
+    return _picked(builder, values[0], values[0], _IN_FIVES)
 
 
-@_operation(floats, color, color, floats)
-def add_outer(builder: Any, values: Any) -> Any:
-    """Four colours, each number of `a` times `b`, added to four others; rounded once where the machine can."""
-    numbers = _picked(builder, values[0], values[0], [lane for lane in range(4) for _ in range(4)])
-    colors = _picked(builder, values[1], values[1], [0, 1, 2, 3] * 4)
-    return _call(builder, "llvm.fmuladd.v16f32", _F16X, numbers, colors, values[2])
+@_operation(floats, types.float32, color, color, floats)
+def add_in_fives(builder: Any, values: Any) -> Any:
+    """A number and the four of `b` times each channel of `c`, added to the last; rounded once where the machine can."""
+    first = builder.insert_element(ir.Constant(_F4X, [0.0] * 4), values[0], ir.Constant(_I32, 0))
+    numbers = _picked(builder, first, values[1], [0, 4, 5, 6, 7] * 3 + [1])
+    channels = _picked(builder, values[2], values[2], _IN_FIVES)
+    return _call(builder, "llvm.fmuladd.v16f32", _F16X, numbers, channels, values[3])
+
+
+@_operation(floats, *(types.float32,) * 5)
+def sixteen_of(builder: Any, values: Any) -> Any:
+    """Five numbers three times over, and 0."""
+    found = ir.Constant(ir.VectorType(_F32, 8), [0.0] * 8)
+    for lane, value in enumerate(values):
+        found = builder.insert_element(found, value, ir.Constant(_I32, lane))
+    return _picked(builder, found, found, [0, 1, 2, 3, 4] * 3 + [5])
+
+
+@_operation(color, floats)
+def sum_of_fives(builder: Any, values: Any) -> Any:
+    """Sums of the first five, of the next five and of the next five, in their order, and 0."""
+    lanes = [_picked(builder, values[0], ir.Constant(_F16X, [0.0] * 16), [k, 5 + k, 10 + k, 16]) for k in range(5)]
+    found = lanes[0]
+    for lane in lanes[1:]:
+        found = builder.fadd(found, lane)
+    return found
 
 
 @_operation(color, color, color, color, color, color, color)

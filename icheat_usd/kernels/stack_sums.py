@@ -13,7 +13,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import N_VALUES
+from icheat_usd.kernels.record_lanes import LANES, add_change
 from icheat_usd.kernels.simd import (
     address_of,
     black,
@@ -21,13 +21,9 @@ from icheat_usd.kernels.simd import (
     color_of,
     color_product,
     difference,
-    four_times,
-    load,
     load_color,
-    multiply_add,
     scale_add,
     scaled,
-    store,
     store_color,
 )
 
@@ -183,7 +179,7 @@ def stack_of_casters(  # type: ignore[no-untyped-def]
     ----------
     begin : (n_records + 1,) int64, entry : (m,) int64
         Entries ``entry[begin[r]:begin[r + 1]]`` of each record.
-    caster : (k,) int32, light : (k, n_blocks, N_VALUES, 4) float32
+    caster : (k,) int32, light : (k, n_blocks, LANES) float32
         Light by caster: `merged_rays.merge_rays`.
     weights : (k, width) float32
         Painted weights that it meets.
@@ -192,7 +188,7 @@ def stack_of_casters(  # type: ignore[no-untyped-def]
     casters, stack, slots : MaskTable, StackTable, SlotTable
     records : (k,) int64
         Records with slots.
-    values : (n_slots, N_VALUES, 4), derivative : (n_derivatives, N_VALUES, 4) float32, out, added to
+    values : (n_slots, LANES), derivative : (n_derivatives, LANES) float32, out, added to
     """
     for g in prange(len(records)):
         _of_casters(
@@ -248,8 +244,8 @@ def _of_casters(  # type: ignore[no-untyped-def]
                 own = own_0 + 32 * n_rows * ((held * (end - first) + s - first) * n_blocks + block)
                 start = load_color(start_0 + 16 * block)
                 change = _composed(own, shifts, is_last, base, n, weight, start, past_0, factor_0)
-                at = light_0 + 16 * N_VALUES * (e * light.shape[1] + block)
-                _add_values(change, at, values_0 + 16 * N_VALUES * s)
+                at = light_0 + 4 * LANES * (e * light.shape[1] + block)
+                add_change(values_0 + 4 * LANES * s, change, at)
                 if slots.derived[s] < slots.derived[s + 1]:
                     _derive(
                         line_0 + 32 * block,
@@ -268,13 +264,5 @@ def _of_casters(  # type: ignore[no-untyped-def]
                     )
                     for q in range(n):
                         if to_place[q] >= 0:
-                            own = derivative_0 + 16 * N_VALUES * (slots.derived[s] + to_place[q])
-                            _add_values(load_color(slope_0 + 16 * q), at, own)
-
-
-@kernel
-def _add_values(factor, at, to):  # type: ignore[no-untyped-def]
-    """Add values (N_VALUES, 4) at an address, each times a colour, to others; four of them at once."""
-    store(to, multiply_add(four_times(factor), load(at), load(to)))
-    for v in range(4, N_VALUES):
-        store_color(to + 16 * v, color_add(factor, load_color(at + 16 * v), load_color(to + 16 * v)))
+                            own = derivative_0 + 4 * LANES * (slots.derived[s] + to_place[q])
+                            add_change(own, load_color(slope_0 + 16 * q), at)
