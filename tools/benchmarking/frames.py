@@ -1,7 +1,8 @@
-"""Suite `frames`: frames per second of each kind of change, every frame computed anew.
+"""Suite `frames`: frames per second of each kind of change; no frame is one that was shown before.
 
-At rest a frame keeps to what matters to these lights and edits. So that the table is honest about that, light colour
-and amount are measured before anything is at rest, too: the product with all that is packed.
+At rest a frame keeps to what matters to these lights and edits: another gain is a sum of the lights' images, a dragged
+amount lies between two. So that the table is honest about that, light colour and amount are measured before anything
+is at rest, too: the product with all that is packed.
 """
 
 from __future__ import annotations
