@@ -138,14 +138,21 @@ def test_the_image_is_off_by_at_most_the_bound_of_the_unedited_indirect_light():
 
 
 def final_error(one: Edit, found: BakedRows) -> float:
-    """RMS difference of the final gather between rows and recipe, relative to what the recipe changes."""
+    """Mean difference of the final gather between rows and recipe, relative to what the recipe changes.
+
+    Of magnitudes, not of squares: those are decided by a path or two that start close to the lamp, and which ones do
+    depends on the last bits of a ray.
+    """
     pipe = pipeline()
-    exact = pipe.final(one, samples=1, rays=64, light_samples=2)
-    rows = pipe.final(as_baked(one, (found, 1.0)), samples=1, rays=64, light_samples=2)
-    assert np.array_equal(exact.indirect, rows.indirect)
-    changed = exact.indirect_edited - exact.indirect
-    assert np.abs(changed).max() > 0.01
-    return float(np.linalg.norm(rows.indirect_edited - exact.indirect_edited) / np.linalg.norm(changed))
+    changed, off = 0.0, 0.0
+    for seed in range(3):
+        exact = pipe.final(one, samples=1, rays=64, light_samples=2, seed=seed)
+        rows = pipe.final(as_baked(one, (found, 1.0)), samples=1, rays=64, light_samples=2, seed=seed)
+        assert np.array_equal(exact.indirect, rows.indirect)
+        assert np.abs(exact.indirect_edited - exact.indirect).max() > 0.01
+        changed += np.abs(exact.indirect_edited - exact.indirect).sum()
+        off += np.abs(rows.indirect_edited - exact.indirect_edited).sum()
+    return float(off / changed)
 
 
 def test_the_final_gather_reads_rows_as_the_recipe():
@@ -155,7 +162,7 @@ def test_the_final_gather_reads_rows_as_the_recipe():
     field = bind(at_full_amount(BRUSH), fine.snapshot)
     finer = bake_field(field, pipeline().view, fine.gather, fine.snapshot, where="/e", epsilon=0.005)
     coarse = final_error(BRUSH, baked(1))
-    assert coarse < 0.2
+    assert coarse < 0.15
     # A sixteenth of the area is a quarter of the distance.
     assert final_error(BRUSH, finer) < 0.4 * coarse
 
