@@ -7,8 +7,8 @@ import numpy as np
 from icheat_usd.kernels.assemble import sum_films
 from icheat_usd.scene import F32, I32
 
-#: An amount that has changed in so many frames one after the other is taken for one that someone drags.
-_FRAMES = 2
+#: An amount that has changed so often, and nothing else in between, is taken for one that someone drags.
+_CHANGES = 3
 _NOBODY: I32 = np.zeros(0, np.int32)
 _NOTHING: F32 = np.zeros((0, 3), np.float32)
 
@@ -26,7 +26,8 @@ class AmountFilms:
     def forget(self) -> None:
         """Something else than one amount has changed."""
         self.path = ""  #: of the edit
-        self._n_frames = 0
+        self._n_changes = 0
+        self._was_wanted = False
         self._whole: F32 | None = None
         self._lacks: F32 | None = None
 
@@ -35,11 +36,13 @@ class AmountFilms:
         if path != self.path or not path:
             self.forget()
             self.path = path
+        self._n_changes += bool(path)
 
     def are_wanted(self) -> bool:
-        """Whether it is time to make the images; is to be asked once in each frame."""
-        self._n_frames += bool(self.path)
-        return self._n_frames == _FRAMES + 1
+        """Whether it is time to make the images, which it is once in a drag: a frame is the same if shown again."""
+        is_time = self._n_changes >= _CHANGES and not self._was_wanted
+        self._was_wanted |= is_time
+        return is_time
 
     def put(self, whole: F32, half: F32) -> None:
         """Take the images (n_pixels, 3) at amounts of 1 and of a half; the second one is changed."""

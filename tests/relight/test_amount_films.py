@@ -55,6 +55,16 @@ def test_an_amount_that_is_dragged_shows_what_each_frame_would_by_itself(path, m
     assert not is_between(other)
 
 
+def test_a_frame_that_is_shown_again_is_the_same():
+    shown = shown_at_rest(SCALES)
+    for amount in DRAGGED:
+        shown.set_amount("/a", amount)
+        once = shown.frame()
+        for _ in range(4):
+            np.testing.assert_array_equal(shown.frame(), once)
+    assert is_between(shown)
+
+
 def test_what_an_edit_does_not_touch_keeps_its_bits():
     one = edit("a", "scale", select("/floor"), select("/red", "/green"))
     nothing = Edit("/none", "scale", {"gain": 1.0}, select("/back"), select("/red", "/green"))
