@@ -145,6 +145,29 @@ def _order_by_direction(n, x, y, z, bin_of, bin_begin, order):  # type: ignore[n
 
 
 @kernel
+def make_packet():  # type: ignore[no-untyped-def]
+    """Room for 16 rays as `trace_16` wants them: which count, their floats, the same as words, and those of one ray."""
+    storage = np.zeros(24 * 16 + 16 + 64, np.float32)
+    shift = np.int64((-storage.ctypes.data % 64) // 4)
+    valid = storage[shift : shift + 16].view(np.int32)
+    rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
+    single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
+    return valid, rays, rays.view(np.uint32), single, single.view(np.uint32)
+
+
+@kernel
+def clear_packet(rays, words):  # type: ignore[no-untyped-def]
+    """Rays without end that have met nothing; origins and directions stay."""
+    rays[3, :] = 0.0
+    rays[7, :] = 0.0
+    rays[8, :] = np.inf
+    words[9, :] = _INVALID
+    words[10, :] = 0
+    words[11, :] = 0
+    words[17:21, :] = _INVALID
+
+
+@kernel
 def trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at):  # type: ignore[no-untyped-def]
     """Nearest hits of a packet, one by one where packets are slower."""
     if trace.packets:
@@ -234,13 +257,7 @@ def count_hits(  # type: ignore[no-untyped-def]
         instances, triangles = np.empty(16, np.int64), np.empty(16, np.int64)
         sides, at = np.empty(16, np.int64), np.empty((16, 6), np.float32)
         stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
-        storage = np.zeros(24 * 16 + 16 + 64, np.float32)
-        shift = np.int64((-storage.ctypes.data % 64) // 4)
-        valid = storage[shift : shift + 16].view(np.int32)
-        rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
-        words = rays.view(np.uint32)
-        single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
-        single_words = single.view(np.uint32)
+        valid, rays, words, single, single_words = make_packet()
         rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
 
         for block in range(lane, (n_rows + together - 1) // together, n_lanes):
@@ -280,13 +297,7 @@ def count_hits(  # type: ignore[no-untyped-def]
                         rays[4, k] = x[e]
                         rays[5, k] = y[e]
                         rays[6, k] = z[e]
-                    rays[3, :] = 0.0
-                    rays[7, :] = 0.0
-                    rays[8, :] = np.inf
-                    words[9, :] = _INVALID
-                    words[10, :] = 0
-                    words[11, :] = 0
-                    words[17:21, :] = _INVALID
+                    clear_packet(rays, words)
                     trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
                     # In steps over the packet, so that the loads of one ray do not wait for those of another.
                     for k in range(width):

@@ -7,7 +7,7 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.bsdf import sample_lobe
-from icheat_usd.kernels.gather_rows import NOTHING, trace_16
+from icheat_usd.kernels.gather_rows import NOTHING, clear_packet, make_packet, trace_16
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 from icheat_usd.kernels.record_rays import cell_of_hit
 from icheat_usd.kernels.tracing import offset_origin
@@ -71,13 +71,7 @@ def _trace_some(  # type: ignore[no-untyped-def]
     """Rays `first` to `last` of `trace_to_cells`."""
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
     stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
-    storage = np.zeros(24 * 16 + 16 + 64, np.float32)
-    shift = np.int64((-storage.ctypes.data % 64) // 4)
-    valid = storage[shift : shift + 16].view(np.int32)
-    rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
-    words = rays.view(np.uint32)
-    single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
-    single_words = single.view(np.uint32)
+    valid, rays, words, single, single_words = make_packet()
     rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
     for begin in range(first, last, 16):
         n = min(16, last - begin)
@@ -88,13 +82,7 @@ def _trace_some(  # type: ignore[no-untyped-def]
             for c in range(3):
                 rays[c, e] = origins[r, c]
                 rays[4 + c, e] = directions[r, c]
-        rays[3, :] = 0.0
-        rays[7, :] = 0.0
-        rays[8, :] = np.inf
-        words[9, :] = _INVALID
-        words[10, :] = 0
-        words[11, :] = 0
-        words[17:21, :] = _INVALID
+        clear_packet(rays, words)
         trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
         for e in range(n):
             r = begin + e

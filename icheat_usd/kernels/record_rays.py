@@ -15,7 +15,7 @@ from icheat_usd.kernels.cell_map import (
     side_seen,
     unit_normal,
 )
-from icheat_usd.kernels.gather_rows import DETOUR, NOTHING, trace_16
+from icheat_usd.kernels.gather_rows import DETOUR, NOTHING, clear_packet, make_packet, trace_16
 from icheat_usd.kernels.locate import nearest_sample
 from icheat_usd.kernels.random import hash_combine, sobol_pair, to_unit
 from icheat_usd.kernels.samples import basis, unit_circle
@@ -109,13 +109,7 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
     """Row r of `trace_hemispheres`."""
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
     stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
-    storage = np.zeros(24 * 16 + 16 + 64, np.float32)
-    shift = np.int64((-storage.ctypes.data % 64) // 4)
-    valid = storage[shift : shift + 16].view(np.int32)
-    rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
-    words = rays.view(np.uint32)
-    single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
-    single_words = single.view(np.uint32)
+    valid, rays, words, single, single_words = make_packet()
     rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
     sx, sy, sz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
     gx, gy, gz = normal[r, 0], normal[r, 1], normal[r, 2]
@@ -130,13 +124,7 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
                 rays[4, e] = x
                 rays[5, e] = y
                 rays[6, e] = z
-            rays[3, :] = 0.0
-            rays[7, :] = 0.0
-            rays[8, :] = np.inf
-            words[9, :] = _INVALID
-            words[10, :] = 0
-            words[11, :] = 0
-            words[17:21, :] = _INVALID
+            clear_packet(rays, words)
             trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
             for e in range(16):
                 column = (j0 + e // _BLOCK) * n_phi + k0 + e % _BLOCK
