@@ -75,6 +75,7 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
 
 def command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.authoring import named_edit, open_for_writing
+    from icheat_usd.cli.compiling import compile_first
     from icheat_usd.cli.progress import ProgressLine
     from icheat_usd.errors import EditError
     from icheat_usd.session import baking, flattening, inspection
@@ -88,6 +89,7 @@ def command(options: argparse.Namespace) -> int:
     frames = options.frames or ((options.frame,) if options.frame is not None else None)
     shot = baking.Shot(options.camera, stack, options.width, options.height, quality)
     with ProgressLine() as progress:
+        compile_first("relight", progress)
         if options.flatten:
             if options.edits:
                 raise EditError("--flatten freezes the whole stack; mute the edits that should not be in it instead")

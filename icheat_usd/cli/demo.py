@@ -34,6 +34,7 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
 
 
 def command(options: argparse.Namespace) -> int:
+    from icheat_usd.cli.compiling import compile_first
     from icheat_usd.cli.imaging import write_film
     from icheat_usd.cli.progress import ProgressLine
     from icheat_usd.image.metrics import mean_ratio
@@ -55,6 +56,7 @@ def command(options: argparse.Namespace) -> int:
     images: list[str] = []
     seconds: dict[str, float] = {}
     with ProgressLine() as progress:
+        compile_first("relight", progress)
         quality = Quality(n_gather=32_768, rays_per_row=256, rays_per_bounce_row=128)
         height = round(options.width * 3 / 4)
         session = Session.open(layer, width=options.width, height=height, quality=quality, progress=progress)
@@ -91,6 +93,7 @@ def command(options: argparse.Namespace) -> int:
 
         ratio = None
         if not options.preview_only:
+            compile_first("render", progress)
             began = time.perf_counter()
             final = session.render(GatherSettings(samples_per_pixel=4, gather_rays=48))
             seconds["final gather"] = time.perf_counter() - began

@@ -46,6 +46,7 @@ def command(options: argparse.Namespace) -> int:
         if not Path(name).parent.is_dir():
             raise ImageError(f"--image {name}: there is no folder '{Path(name).parent}'; make it first")
 
+    from icheat_usd.cli.compiling import compile_first
     from icheat_usd.cli.progress import ProgressLine
     from icheat_usd.session import DRAFT, Session
 
@@ -54,6 +55,7 @@ def command(options: argparse.Namespace) -> int:
     content: dict[str, Any] = {"stage": options.stage}
     lines: list[str] = []
     with ProgressLine() as progress:
+        compile_first("relight", progress)
         session = Session.open(
             options.stage,
             camera=options.camera,

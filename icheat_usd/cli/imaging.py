@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from icheat_usd.cli.compiling import compile_first
 from icheat_usd.cli.frames import frame_path, has_frame
 from icheat_usd.cli.options import finding_as_json, finding_as_text, print_json
 from icheat_usd.cli.progress import ProgressLine
@@ -45,6 +46,7 @@ def make_images(options: argparse.Namespace, quality: Quality, make: Callable[[S
     found: dict[Any, None] = {}
     stage = open_stage(options.stage)
     with ProgressLine() as progress:
+        compile_first("relight", progress)
         for frame in frames:
             began = time.perf_counter()
             progress.prefix = f"frame {frame:g}: " if frame is not None and len(frames) > 1 else ""

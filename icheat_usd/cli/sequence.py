@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from icheat_usd.cli.compiling import compile_first
 from icheat_usd.cli.imaging import output_path, report
 from icheat_usd.cli.progress import ProgressLine
 from icheat_usd.errors import IcheatError, ImageError
@@ -51,6 +52,7 @@ def render_frames(options: argparse.Namespace, settings: GatherSettings) -> int:
 
     images: list[dict[str, Any]] = []
     with ProgressLine() as progress:
+        compile_first("render", progress)
         for frame in frames:
             name = f"frame {frame:g}" if frame is not None else ""
             progress.prefix = f"{name}: " if name and len(frames) > 1 else ""

@@ -1,9 +1,10 @@
 """Compile every kernel now, so that no first use has to wait for it.
 
 Run it after installing, or when an image is built that others start from; a
-minute or two on two cores, seconds if there is nothing to do. Compiled code
-lies in the user's cache folder, or under $ICHEAT_CACHE_DIR, by the contents of
-its sources, the versions of its libraries and the processor.
+minute or two on two cores, less on more, seconds if there is nothing to do.
+Commands that compute do the same for what they need when they are first run.
+Compiled code lies in the user's cache folder, or under $ICHEAT_CACHE_DIR, by
+the contents of its sources, the versions of its libraries and the processor.
 """
 
 from __future__ import annotations
@@ -20,20 +21,17 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
 
 
 def command(options: argparse.Namespace) -> int:
+    from icheat_usd.cli.progress import ProgressLine
     from icheat_usd.kernels._jit import cache_directory
-    from icheat_usd.session.warming import warm
-
-    seconds: dict[str, float] = {}
-
-    def say(name: str, took: float) -> None:
-        seconds[name] = round(took, 1)
-        if not options.json:
-            print(f"{name}: {took:.1f} s", flush=True)
+    from icheat_usd.session.warming import PURPOSES, compile_ahead
 
     began = time.monotonic()
-    warm(options.jobs, say)
+    with ProgressLine() as progress:
+        n = compile_ahead(PURPOSES, options.jobs, progress)
+    seconds = time.monotonic() - began
     if options.json:
-        print_json({"folder": str(cache_directory()), "seconds": seconds, "total": round(time.monotonic() - began, 1)})
+        print_json({"folder": str(cache_directory()), "kernels": n, "seconds": round(seconds, 1)})
     else:
-        print(f"kernels are compiled in {cache_directory()}; {time.monotonic() - began:.1f} s")
+        done = f"{n} kernels are compiled" if n else "all kernels had been compiled"
+        print(f"{done} in {cache_directory()}; {seconds:.1f} s")
     return 0

@@ -1,43 +1,173 @@
-"""Warming: every task runs in a process of its own, and a failure is one sentence."""
+"""Kernels compiled ahead: the list knows all that is called, callers come last, and what fails is named."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
-import time
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+from numba.core import types
 
 from icheat_usd.cli import main
 from icheat_usd.errors import IcheatError
+from icheat_usd.kernels._signatures import UnlistedTypeError, decode, dispatchers, encode, kernels_called
 from icheat_usd.session import warming
+from icheat_usd.session.warming import PURPOSES, Listed, compile_ahead, listed
+from tools.kernel_list import TASKS, recorded
 
 
-def test_tasks_run_in_processes_and_are_reported(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+class Pair(NamedTuple):
+    first: object
+    second: object
+
+
+COLOURS = types.Array(types.float32, 2, "C")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        types.int64,
+        types.boolean,
+        types.none,
+        types.literal(6),
+        COLOURS,
+        types.Array(types.uint8, 1, "A", readonly=True),
+        types.NamedTuple((COLOURS, types.float64), Pair),
+        types.NamedUniTuple(COLOURS, 2, Pair),
+        types.UniTuple(types.int64, 3),
+        types.Tuple((types.int64, types.NamedTuple((COLOURS, types.float64), Pair))),
+    ],
+    ids=str,
+)
+def test_a_type_comes_back_from_the_list_as_it_was(kind: types.Type) -> None:
+    assert decode(json.loads(json.dumps(encode(kind)))) == kind
+
+
+def test_a_type_without_a_word_is_named() -> None:
+    with pytest.raises(UnlistedTypeError, match="unicode_type"):
+        encode(types.unicode_type)
+
+
+def test_the_list_is_of_kernels_as_they_are() -> None:
+    kernels = dict(dispatchers())
+    for entry in listed():
+        assert entry.kernel in kernels, f"{entry.kernel} has gone; run tools/list_kernels"
+        code = kernels[entry.kernel].py_func.__code__
+        assert len(entry.types) == code.co_argcount, f"{entry.kernel} has other arguments; run tools/list_kernels"
+        assert entry.calls == kernels_called(kernels[entry.kernel]), f"{entry.kernel}: run tools/list_kernels"
+        assert set(entry.purposes) <= set(PURPOSES)
+
+
+@pytest.mark.parametrize("purpose", PURPOSES)
+def test_what_is_called_is_listed(purpose: str) -> None:
+    known = {(entry.kernel, json.dumps(entry.types)) for entry in listed() if purpose in entry.purposes}
+    found = [entry for entry in recorded(purpose) if (entry.kernel, json.dumps(entry.types)) not in known]
+    assert not found, f"not in the list for '{purpose}', run tools/list_kernels: {[entry.kernel for entry in found]}"
+    assert set(TASKS) == set(PURPOSES)
+
+
+def entry(kernel: str, *calls: str, purposes: tuple[str, ...] = ("live",), size: int = 1) -> Listed:
+    return Listed(kernel, ["int64"], list(purposes), list(calls), size)
+
+
+@pytest.fixture
+def listing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
+    monkeypatch.setenv("ICHEAT_CACHE_DIR", str(tmp_path))
+    (tmp_path / "kernels").mkdir()
+    return monkeypatch
+
+
+class FakeWorker:
+    """Remembers what began and what ended, in order."""
+
+    events: list[tuple[str, str]]
+
+    def compile(self, entry: Listed) -> str:
+        self.events.append(("begins", entry.kernel))
+        self.events.append(("ends", entry.kernel))
+        return "its reason" if entry.kernel == "a.broken" else ""
+
+    def end(self) -> None:
+        self.events.append(("stopped", ""))
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_what_is_called_is_compiled_before_its_callers_and_the_rest_is_left(
+    listing: pytest.MonkeyPatch, jobs: int
 ) -> None:
-    monkeypatch.setattr(warming, "TASKS", {"relight": warming.TASKS["relight"]})
+    entries = (
+        entry("a.main", "b.part", "b.other"), entry("b.part", "c.least", purposes=("render",)), entry("b.other"),
+        entry("c.least", purposes=("relight",)), entry("d.unneeded", purposes=("relight",)),
+    )  # fmt: skip
+    events: list[tuple[str, str]] = []
+    listing.setattr(warming, "listed", lambda: entries)
+    listing.setattr(warming, "_Worker", type("Worker", (FakeWorker,), {"events": events}))
+    said: list[float] = []
+    assert compile_ahead(("live",), jobs, lambda step, fraction: said.append(fraction)) == 4
+    for caller in entries[:3]:
+        for called in caller.calls:
+            assert events.index(("ends", called)) < events.index(("begins", caller.kernel))
+    assert ("begins", "d.unneeded") not in events
+    assert events.count(("stopped", "")) == min(jobs, 4)
+    assert said == sorted(said) and said[-1] == 1.0
+    assert compile_ahead(("live",), jobs) == 0, "it is known to be complete"
+    assert compile_ahead(("live", "relight"), jobs) == 5
+
+
+def test_a_kernel_that_does_not_compile_is_named_and_nothing_is_marked_complete(
+    listing: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    events: list[tuple[str, str]] = []
+    listing.setattr(warming, "listed", lambda: (entry("a.fine"), entry("a.broken")))
+    listing.setattr(warming, "_Worker", type("Worker", (FakeWorker,), {"events": events}))
+    with pytest.raises(IcheatError, match="kernel a.broken of signatures.json does not compile: its reason"):
+        compile_ahead(("live",), 2)
+    assert events.count(("stopped", "")) == 2
+    assert not list((tmp_path / "kernels").glob("*.complete"))
+
+
+def test_processes_compile_into_the_cache_and_answer_for_what_they_can_not(
+    listing: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    real = [one for one in listed() if one.kernel == "random.to_unit"]
+    assert real
+    listing.setattr(warming, "listed", lambda: tuple(real))
+    assert compile_ahead(real[0].purposes, 2) == len(real)
+    words = json.dumps(real[0].types)
+    code = (
+        "import json; from icheat_usd.kernels.random import to_unit as kernel;"
+        f"from icheat_usd.kernels._signatures import decode; kernel.compile(tuple(map(decode, json.loads({words!r}))));"
+        "print(sum(kernel.stats.cache_hits.values()), sum(kernel.stats.cache_misses.values()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "0"]
+
+    for wrong, message in (
+        (real[0]._replace(kernel="random.gone"), "random.gone .*there is no such kernel"),
+        (real[0]._replace(types=[]), "random.to_unit .*"),
+    ):
+        listing.setattr(warming, "listed", lambda wrong=wrong: (wrong,))
+        for mark in (tmp_path / "kernels").glob("*.complete"):
+            mark.unlink()
+        with pytest.raises(IcheatError, match=message):
+            compile_ahead(real[0].purposes[:1], 1)
+
+
+def test_a_process_that_ends_early_is_told(listing: pytest.MonkeyPatch) -> None:
+    listing.setattr(warming, "listed", lambda: (entry("a.fine"),))
+    listing.setattr(warming.sys, "executable", "/bin/false")
+    with pytest.raises(IcheatError, match="a.fine .*its process ended with code 1"):
+        compile_ahead(("live",), 1)
+
+
+def test_warm_says_where_kernels_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["warm", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
-    assert list(content["seconds"]) == ["relight"] and content["folder"].endswith("kernels")
-
-
-def test_a_task_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warming, "TASKS", {"nonsense": lambda: None})
-    with pytest.raises(IcheatError, match="kernels of 'nonsense' failed: KeyError"):
-        warming.warm()
-
-
-def test_a_task_that_says_much_is_not_held_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """More than a pipe holds, and then a failure, whose last line is what is told."""
-    code = "import sys; sys.stderr.write('much to say\\n' * 100_000); sys.exit('enough')"
-    start = warming.subprocess.Popen
-
-    def noisy(command: list[str], **options: object) -> object:
-        return start([sys.executable, "-c", code], **options)
-
-    monkeypatch.setattr(warming.subprocess, "Popen", noisy)
-    began = time.monotonic()
-    with pytest.raises(IcheatError, match="failed: enough"):
-        warming.warm(1)
-    assert time.monotonic() - began < 30
+    assert set(content) == {"version", "folder", "kernels", "seconds"} and content["folder"].endswith("kernels")
+    assert main(["warm"]) == 0
+    assert capsys.readouterr().out.startswith("all kernels had been compiled in ")

@@ -1,0 +1,119 @@
+"""Finds which kernels are called, with which types, by doing a little of everything on small stages."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from icheat_usd.final_gather import GatherSettings
+from icheat_usd.kernels._signatures import UnlistedTypeError, dispatchers, encode, kernels_called
+from icheat_usd.resources import resource_path
+from icheat_usd.session.document import Session
+from icheat_usd.session.live import LiveSession
+from icheat_usd.session.quality import DRAFT, LIVE, PREVIEW, RECORDS, Quality
+from icheat_usd.session.warming import Listed
+
+_ROOT = Path(__file__).parents[1]
+_WIDTH, _HEIGHT = 64, 48
+_LITTLE: dict[str, Any] = {"n_gather": 1024, "rays_per_row": 16, "rays_per_bounce_row": 16, "light_samples": 2}
+_LIVE = replace(LIVE, **_LITTLE, record_rays=128)
+#: What `icheat relight` does, with `--draft` and with `--exact`.
+_RELIGHT = (replace(RECORDS, **_LITTLE, record_rays=128), replace(DRAFT, **_LITTLE), replace(PREVIEW, **_LITTLE))
+#: A lamp and opaque walls; a sky, glass, metal and painted edits.
+_STAGES = ("cornell_box", "glossy_set")
+
+
+def _live() -> None:
+    for name in _STAGES:
+        with LiveSession.open(_stage(name), width=_WIDTH, height=_HEIGHT, quality=_LIVE) as live:
+            live.frame()
+            light = next(iter(live.lights))
+            live.set_light(light, gain=0.5, move=(0.01, 0.0, 0.0))
+            for edit in live.stack.edits:
+                live.set_amount(edit.path, 0.5)
+            live.frame()
+            live.film()
+            # What lights at rest have under other gains, where nothing keeps it from being a sum over them.
+            for edit in live.stack.edits:
+                live.mute(edit.path)
+            live.film()
+            live.set_light(light, gain=0.4)
+            live.frame()
+
+
+def _relight() -> None:
+    for name in _STAGES:
+        for quality in _RELIGHT:
+            _open(name, quality).relight()
+
+
+def _render() -> None:
+    for name in _STAGES:
+        _open(name, replace(PREVIEW, **_LITTLE)).render(GatherSettings(samples_per_pixel=1, light_samples=1))
+
+
+def _open(name: str, quality: Quality) -> Session:
+    return Session.open(_stage(name), width=_WIDTH, height=_HEIGHT, quality=quality)
+
+
+def _stage(name: str) -> Path:
+    return resource_path(f"sample_stages/{name}/shot.usda")
+
+
+#: What is done for each purpose of `icheat_usd.session.warming`.
+TASKS: dict[str, Callable[[], None]] = {"live": _live, "relight": _relight, "render": _render}
+
+
+def record(purpose: str) -> None:
+    """Do what a purpose does, and print the kernels that this process has compiled or loaded, as JSON."""
+    TASKS[purpose]()
+    found = []
+    for name, dispatcher in dispatchers():
+        for types in dispatcher.overloads:
+            try:
+                words = [encode(kind) for kind in types]
+            except UnlistedTypeError as error:  # it is compiled with its caller
+                print(f"{name} is left out: the list has no word for the type {error}", file=sys.stderr)
+                continue
+            found.append((name, words, [purpose], kernels_called(dispatcher), len(dispatcher.py_func.__code__.co_code)))
+    print(json.dumps(found))
+
+
+def recorded(purpose: str, cache: str | None = None, keeps: bool = False) -> list[Listed]:
+    """What `record` prints in a process of its own.
+
+    Parameters
+    ----------
+    cache : str, optional
+        Folder for what is compiled; by default the user's. A kernel that is found there does not tell which others it
+        calls with which types.
+    keeps
+        Whether what is computed is kept there, too: what is found on disk may be of other types than what is made.
+    """
+    environment = os.environ | ({} if cache is None else {"ICHEAT_CACHE_DIR": cache})
+    environment["ICHEAT_CACHE_SIZE"] = "1G" if keeps else "0"
+    command = [sys.executable, "-c", f"from tools.kernel_list import record; record({purpose!r})"]
+    done = subprocess.run(command, cwd=_ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    return [Listed(*entry) for entry in json.loads(done.stdout.splitlines()[-1])]
+
+
+def merged(entries: list[Listed]) -> list[Listed]:
+    """Every kernel and choice of types once, for all purposes that have it, by name."""
+    found: dict[tuple[str, str], Listed] = {}
+    for entry in entries:
+        key = entry.kernel, json.dumps(entry.types)
+        purposes = {*entry.purposes, *(found[key].purposes if key in found else ())}
+        found[key] = entry._replace(purposes=sorted(purposes))
+    return [found[key] for key in sorted(found)]
+
+
+def text_of(entries: list[Listed]) -> str:
+    """A line for each, so that a change shows what it changes."""
+    lines: list[Any] = [json.dumps(entry, separators=(",", ":")) for entry in entries]
+    return "[\n" + ",\n".join(lines) + "\n]\n"
