@@ -21,9 +21,9 @@ import numpy as np
 
 from icheat_usd.edits.model import Edit, EditStack, Region, Selection, Shape
 from icheat_usd.final_gather import GatherSettings
-from icheat_usd.samples import view_samples
+from icheat_usd.samples import ViewSamples, view_samples
 from icheat_usd.samples.develop import average
-from icheat_usd.scene import F32, F64, Bool, SceneSnapshot
+from icheat_usd.scene import F32, F64, Bool, Camera, SceneSnapshot
 from icheat_usd.stage import open_stage, take_snapshot
 from tools.benchmarking.generated import WALL_ALBEDO, WALL_AREA, WALL_COSINE, write_screened
 from tools.benchmarking.goals import Goal, at_most
@@ -37,8 +37,11 @@ from tools.benchmarking.statistics import relative_error
 from tools.peers.mitsuba_peer import as_diffuse
 
 _THREADS = (1, 2, 8)
-_SIZE, _QUICK_SIZE = (160, 120), (24, 18)
+_QUICK_SIZE = (24, 18)
+#: Pixels about the middle of the edge that brute force makes: of a whole picture they would take hours.
+_CROP, _QUICK_CROP = (128, 96), (16, 12)
 _BAND = 8  #: pixels to either side of the edge
+_WITHIN = 256  #: samples of a pixel that find whether the edge crosses it: a corner of it will do
 _GAIN = 3.0  #: inside the mask
 _REFERENCE = GatherSettings(method="brute", samples_per_pixel=4, gather_rays=512)
 _QUICK_REFERENCE = replace(_REFERENCE, gather_rays=8)
@@ -55,42 +58,71 @@ def cases(stages: list[str], quick: bool) -> list[dict[str, Any]]:
 def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> dict[str, Any]:
     """Figures of one property."""
     if case["property"] == "edge":
-        return _edge(case["stage"], quick, folder)
+        return _edge(case["stage"], _QUICK_SIZE if quick else (effort.width, effort.height), quick, folder)
     if case["property"] == "offset":
         return _offset(usual(quick))
     return _bits(case["stage"], _QUICK_SIZE if quick else (effort.width // 2, effort.height // 2), quick)
 
 
-def _edge(stage: str, quick: bool, folder: Path) -> dict[str, Any]:
+def _edge(stage: str, size: tuple[int, int], quick: bool, folder: Path) -> dict[str, Any]:
     """A hard-edged region on the surface that is seen most, for light from all and from the first caster."""
-    width, height = _QUICK_SIZE if quick else _SIZE
-    snapshot = as_diffuse(take_snapshot(open_stage(stage), width=width, height=height))
+    snapshot = as_diffuse(take_snapshot(open_stage(stage), width=size[0], height=size[1]))
     frame = Frame(snapshot, usual(quick))
     shares = shares_of(frame)
     receiver = max(shares.seen, key=lambda path: shares.seen[path])
     caster = max((p for p in shares.hit if p != receiver), key=lambda path: shares.hit[path])
     region = _half(frame, receiver)
-    band, crossed = _band(frame, receiver, region)
-    found: dict[str, Any] = {"receiver": receiver, "caster": caster}
+    rows, columns = _crop(frame, receiver, region, _QUICK_CROP if quick else _CROP)
+    cropped = replace(snapshot, camera=_camera_of(snapshot.camera, rows, columns))
+    band, crossed = _band(Frame(cropped, usual(quick)), receiver, region)
+    found: dict[str, Any] = {"receiver": receiver, "caster": caster, "width": size[0], "height": size[1]}
     found |= {"pixels": int(band.sum()), "crossed": int(crossed.sum())}
     for name, casters in (("from all", frozenset(shares.hit)), ("from one caster", frozenset([caster]))):
         edit = Edit("/edge", "scale", {"gain": _GAIN}, Selection(frozenset([receiver]), (region,)), Selection(casters))
         stack = EditStack("/Edge", (edit,))
         image, _ = frame.render(frame.field(stack))
-        halves = [_reference(snapshot, stack, seed, quick) for seed in (1, 2)]
+        ours, ours_unedited = image.indirect_edited[rows, columns], image.indirect[rows, columns]
+        halves = [_reference(cropped, stack, seed, quick) for seed in (1, 2)]
         edited, across = (
-            relative_error(image.indirect_edited[some], *(half.indirect_edited[some] for half in halves))
-            for some in (band, crossed)
+            relative_error(ours[some], *(half.indirect_edited[some] for half in halves)) for some in (band, crossed)
         )
-        unedited = relative_error(image.indirect[band], *(half.indirect[band] for half in halves))
+        unedited = relative_error(ours_unedited[band], *(half.indirect[band] for half in halves))
         mean = (halves[0].indirect_edited + halves[1].indirect_edited) / 2
         found[name] = {
             "edited": edited.as_dict(),
             "unedited": unedited.as_dict(),
             "crossed": across.as_dict(),
-            "image": write_sheet(folder / "properties" / f"edge {name}.png", image.indirect_edited, mean),
+            "image": write_sheet(folder / "properties" / f"edge {name}.png", ours, mean),
         }
     return found
+
+
+def _crop(frame: Frame, path: str, region: Region, size: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of a part of the picture, about the middle of where the region ends on a surface."""
+    camera = frame.snapshot.camera
+    inside, on = _inside(frame, frame.view, path, region)
+    values = np.stack([inside & on, on & ~inside], axis=1).astype(np.float32)
+    within, beyond = (column.reshape(camera.height, camera.width) > 0 for column in average(frame.view, values).T)
+    places = np.argwhere(_grown(within, 1) & _grown(beyond, 1)).astype(float)
+    centre = places[np.argmin(np.square(places - places.mean(axis=0)).sum(axis=1))]
+    parts = []
+    for middle, n, most in zip(centre, size[::-1], (camera.height, camera.width), strict=True):
+        first = min(max(int(middle) - n // 2, 0), most - n)
+        parts.append(slice(first, first + n))
+    return parts[0], parts[1]
+
+
+def _camera_of(camera: Camera, rows: slice, columns: slice) -> Camera:
+    """The camera of some pixels, which look where they did."""
+    left, right, bottom, top = camera.window
+    across, down = (right - left) / camera.width, (top - bottom) / camera.height
+    window = (
+        left + across * columns.start,
+        left + across * columns.stop,
+        top - down * rows.stop,
+        top - down * rows.start,
+    )
+    return replace(camera, window=window, width=columns.stop - columns.start, height=rows.stop - rows.start)
 
 
 def _reference(snapshot: SceneSnapshot, stack: EditStack, seed: int, quick: bool) -> Any:
@@ -124,18 +156,23 @@ def _band(frame: Frame, path: str, region: Region) -> tuple[Bool, Bool]:
     What is shown of the latter depends on where in the pixel camera samples fall, whatever the light is.
     """
     camera = frame.snapshot.camera
-    view = view_samples(frame.snapshot, frame.tracer, samples_per_pixel=16, max_splits=0)
-    rows = [i for i, surface in enumerate(frame.snapshot.surfaces) if surface.path == path]
-    on = np.isin(frame.snapshot.geometry.instance_surface[view.points.instance], rows)
-    matrix = np.array(region.to_shape).reshape(3, 4)
-    local = (view.points.position.astype(float) + frame.snapshot.centre) @ matrix[:, :3].T + matrix[:, 3]
-    inside = (np.abs(local) <= 1).all(axis=1)
+    view = view_samples(frame.snapshot, frame.tracer, samples_per_pixel=_WITHIN, max_splits=0)
+    inside, on = _inside(frame, view, path, region)
     shape = (camera.height, camera.width)
     values = np.stack([inside, on], axis=1).astype(np.float32)
     share, surface = (column.reshape(shape) for column in average(view, values).T)
     near = _grown((share > 0) & (surface == 1), _BAND) & _grown((share < 1) & (surface == 1), _BAND)
     crossed = (share > 0) & (share < 1) & (surface == 1)
     return np.asarray(near & (surface == 1) & ~crossed), np.asarray(crossed)
+
+
+def _inside(frame: Frame, view: ViewSamples, path: str, region: Region) -> tuple[Bool, Bool]:
+    """Which view samples are inside the region, and which are on the surface: (n_view,) each."""
+    rows = [i for i, surface in enumerate(frame.snapshot.surfaces) if surface.path == path]
+    on = np.isin(frame.snapshot.geometry.instance_surface[view.points.instance], rows)
+    matrix = np.array(region.to_shape).reshape(3, 4)
+    local = (view.points.position.astype(float) + frame.snapshot.centre) @ matrix[:, :3].T + matrix[:, 3]
+    return np.asarray((np.abs(local) <= 1).all(axis=1)), on
 
 
 def _grown(mask: Bool, by: int) -> Bool:
@@ -201,8 +238,9 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
     if "edge" in found:
         stage, edge = found["edge"]
         lines += [
-            f"Relative RMS errors (± standard error) within {_BAND} pixels of a hard edge of a mask, {stage}:"
-            f" {edge['pixels']} pixels beside it, and {edge['crossed']} that it crosses.",
+            f"Relative RMS errors (± standard error) within {_BAND} pixels of a hard edge of a mask, {stage},"
+            f" {edge['width']} x {edge['height']}: {edge['pixels']} pixels beside it,"
+            f" and {edge['crossed']} that it crosses.",
             "",
             "| light scaled | beside it, edited | unedited | pixels that it crosses, edited |",
             "| --- | ---: | ---: | ---: |",
