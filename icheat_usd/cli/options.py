@@ -7,7 +7,6 @@ import json
 import math
 import re
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -58,7 +57,7 @@ def add_why(parser: argparse.ArgumentParser) -> None:
 
 def why(options: argparse.Namespace) -> str:
     """What the history of a payload shall say: --why, else the command line."""
-    return options.why if options.why is not None else shlex.join(["icheat", *sys.argv[1:]])[:500]
+    return options.why if options.why is not None else shlex.join(["icheat", *options.given])[:500]
 
 
 def add_frame(parser: argparse.ArgumentParser, help: str = "time code; default the stage's first") -> None:

@@ -94,6 +94,7 @@ def run(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     try:
         options = build_parser().parse_args(given)
+        options.given = given
     except UsageError as error:
         print(error, file=sys.stderr)
         if "--json" in given:

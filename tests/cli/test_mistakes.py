@@ -174,7 +174,7 @@ def test_keys_say_why_by_default_as_edits_do(shot: Path, capsys: pytest.CaptureF
     capsys.readouterr()
     assert main(["history", str(shot), "warm", "--json"]) == 0
     whys = [event["why"] for event in json.loads(capsys.readouterr().out)["events"]]
-    assert "hotter" in whys and any(why.startswith("icheat ") for why in whys)
+    assert "hotter" in whys and f"icheat key set {shot} warm --frame 5 --set gain=5" in whys
 
 
 @pytest.mark.parametrize("words", [["--noise", "0.1"], ["--edge-samples", "0"]])

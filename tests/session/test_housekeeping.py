@@ -416,11 +416,8 @@ def test_history_says_which_payload_came_when_from_whom_and_why(shot: Path, caps
     assert run(["history", str(shot), "nothing"]) == FAILURE
 
 
-def test_the_command_line_is_the_reason_where_none_is_given(
-    shot: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_is_the_reason_where_none_is_given(shot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = ["edit", "add", str(shot), "cold", "--receivers", "Floor", "--casters", "Wall", "--set", "gain=0.5"]
-    monkeypatch.setattr("sys.argv", ["icheat", *line])
     assert run(line) == CLEAN
     (entry,) = read_history(shot.parent / "shot.v003.icheat.h5")
     assert entry.why.startswith("icheat edit add ") and entry.edit == "/World/Edits/cold"
