@@ -8,7 +8,8 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.simd import address_of, black, load_color, scale_add, store_color
+from icheat_usd.kernels.lanes import add_short, add_short_fours, store_short, sum_of_fours
+from icheat_usd.kernels.simd import address_of, color_of, fetch, plus, store_color, zeros
 
 _LEAST = 8  # cells of a part of a cluster
 LANES = 64  # rows of a block of a dense matrix
@@ -33,7 +34,7 @@ def shorten(indices: np.ndarray, weights: np.ndarray, column_bits: int, out: np.
 @parallel_kernel
 def take_change(
     begin: np.ndarray, share: np.ndarray, radiance: np.ndarray, before: np.ndarray, direct: np.ndarray,
-    light: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
+    light: np.ndarray, short: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
 ) -> None:  # fmt: skip
     """Light of cells whose direct light has changed, before bounces have: ``light = radiance + direct - before``.
 
@@ -45,10 +46,11 @@ def take_change(
     radiance, before : (n_gather, 3) float32; or no rows: black
     direct : (n_gather, 3) float32
     light : (n_gather, 4) float32
+    short : (n_gather,) uint64, the same as `lanes.store_short` shortens it
     leaves : (3, n_clusters) float32, mean change
     sizes : (n_clusters, 2) float32, sums of the sizes of the changes and of the direct light
     """
-    from_black = len(before) == 0
+    from_black, target = len(before) == 0, address_of(short)
     for c in prange(len(begin) - 1):
         r, g, b = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         changed, all_of_it = np.float32(0.0), np.float32(0.0)
@@ -61,6 +63,7 @@ def take_change(
                 y -= before[i, 1]
                 z -= before[i, 2]
                 light[i, 0], light[i, 1], light[i, 2] = radiance[i, 0] + x, radiance[i, 1] + y, radiance[i, 2] + z
+            store_short(target + i * 8, color_of(light[i, 0], light[i, 1], light[i, 2]))
             changed += abs(x) + abs(y) + abs(z)
             r += share[i] * x
             g += share[i] * y
@@ -78,23 +81,21 @@ def _part_of(begin: int, end: int, part: int, parts: int) -> tuple[int, int]:
 
 
 @kernel
-def _arrives(entries: np.ndarray, first: int, end: int, mask: int, light: int) -> Any:
-    """Light that arrives by the entries from `first` up to `end`; `light` is an address of colours."""
-    weights = entries.view(np.float32)
-    # four sums, so that an addition need not wait for the one before
-    s0, s1, s2, s3 = black(), black(), black(), black()
-    e = first
-    while e + 4 <= end:
-        s0 = scale_add(load_color(light + np.int64(entries[e] & mask) * 16), weights[e], s0)
-        s1 = scale_add(load_color(light + np.int64(entries[e + 1] & mask) * 16), weights[e + 1], s1)
-        s2 = scale_add(load_color(light + np.int64(entries[e + 2] & mask) * 16), weights[e + 2], s2)
-        s3 = scale_add(load_color(light + np.int64(entries[e + 3] & mask) * 16), weights[e + 3], s3)
-        e += 4
-    while e < end:
-        s0 = scale_add(load_color(light + np.int64(entries[e] & mask) * 16), weights[e], s0)
-        e += 1
-    one = np.float32(1.0)
-    return scale_add(scale_add(s0, one, s1), one, scale_add(s2, one, s3))
+def _arrives(entries: np.ndarray, first: int, end: int, mask: int, short: int) -> Any:
+    """Light that arrives by the entries from `first` up to `end`; `short` is an address of short colours."""
+    place, n, weights = address_of(entries) + first * 4, end - first, entries.view(np.float32)
+    # two sums, so that an addition need not wait for the one before
+    s0, s1 = zeros(), zeros()
+    for _ in range(n // 8):
+        s0 = add_short_fours(place, short, mask, s0)
+        s1 = add_short_fours(place + 16, short, mask, s1)
+        place += 32
+    if n & 4:
+        s0 = add_short_fours(place, short, mask, s0)
+    total = sum_of_fours(plus(s0, s1))
+    for e in range(end - (n & 3), end):
+        total = add_short(short + np.int64(entries[e] & np.uint32(mask)) * 8, weights[e], total)
+    return total
 
 
 @parallel_kernel
@@ -106,6 +107,7 @@ def find_missing(
     column_bits: int,
     direct: np.ndarray,
     light: np.ndarray,
+    short: np.ndarray,
     albedo: np.ndarray,
     part: int,
     parts: int,
@@ -126,6 +128,8 @@ def find_missing(
     entries : (n_entries,) uint32, of `shorten`
     direct, albedo : (n_gather, 3) float32
     light : (n_gather, 4) float32, 16-byte rows; the fourth column is 0
+    short : (n_gather,) uint64, of `take_change`
+        What the rows reach: half as long, it stays in the cache of a core.
     part, parts : int
         Every `parts`-th cell of a cluster, from number `part` on.
     missing : (n_gather, 4) float32, 16-byte rows
@@ -137,28 +141,32 @@ def find_missing(
     sizes : (n_clusters, 2) float32
         Sums of the sizes of the missing light, as far as it was found, and of the light at the same cells.
     """
-    mask = np.uint32((1 << column_bits) - 1)
+    mask = (1 << column_bits) - 1
     for c in prange(len(begin) - 1):
         _find_missing(
-            begin[c], begin[c + 1], c, share, indptr, entries, mask, direct, light, albedo, part, parts, missing,
-            arriving, leaves, sizes,
+            begin[c], begin[c + 1], c, share, indptr, entries, mask, direct, light, short, albedo, part, parts,
+            missing, arriving, leaves, sizes,
         )  # fmt: skip
 
 
 @kernel
 def _find_missing(
     first: int, last: int, c: int, share: np.ndarray, indptr: np.ndarray, entries: np.ndarray, mask: int,
-    direct: np.ndarray, light: np.ndarray, albedo: np.ndarray, part: int, parts: int, missing: np.ndarray,
-    arriving: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
+    direct: np.ndarray, light: np.ndarray, short: np.ndarray, albedo: np.ndarray, part: int, parts: int,
+    missing: np.ndarray, arriving: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
 ) -> None:  # fmt: skip
     """`find_missing` for cluster `c`, the cells from `first` up to `last`."""
-    start, target = address_of(light), address_of(missing)
+    start, target = address_of(short), address_of(missing)
     zero = np.float32(0.0)
     r, g, b = zero, zero, zero
     white_r, white_g, white_b = zero, zero, zero
     lacking, here = zero, zero
     begin, step = _part_of(first, last, part, parts)
     for i in range(begin, last, step):
+        if step > 1 and i + step < last:
+            # of a part the machine does not see which rows come next
+            for e in range(indptr[i + step], indptr[i + step + 1], 16):
+                fetch(address_of(entries) + e * 4)
         store_color(target + i * 16, _arrives(entries, indptr[i], indptr[i + 1], mask, start))
         for k in range(3):
             missing[i, k] = direct[i, k] - light[i, k] + albedo[i, k] * missing[i, k]
@@ -189,7 +197,7 @@ def _find_missing(
 @parallel_kernel
 def add_missing(
     begin: np.ndarray, albedo: np.ndarray, missing: np.ndarray, here: np.ndarray, later: np.ndarray, part: int,
-    parts: int, light: np.ndarray, out: np.ndarray,
+    parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Add to `light` what was missing and what cells reflect of its later bounces.
 
@@ -200,8 +208,10 @@ def add_missing(
     here, later : (n_clusters, 3) float32
         What arrives at other cells than those of the part, and the later bounces that arrive at all.
     light : (n_gather, 4) float32
+    short : (n_gather,) uint64, set to the same
     out : (n_gather, 3) float32, the new light once more; or no rows
     """
+    target = address_of(short)
     for c in prange(len(begin) - 1):
         first, step = _part_of(begin[c], begin[c + 1], part, parts)
         for i in range(begin[c], begin[c + 1]):
@@ -217,6 +227,7 @@ def add_missing(
                 light[i, k] = value
                 if len(out) > 0:
                     out[i, k] = value
+            store_short(target + i * 8, color_of(light[i, 0], light[i, 1], light[i, 2]))
 
 
 @parallel_kernel

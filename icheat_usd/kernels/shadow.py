@@ -148,14 +148,26 @@ def _shine(gloss: int, place: int, lane: int, scratch: int) -> None:
 
 
 @kernel
+def _prepare_packet(rays: np.ndarray) -> None:
+    """What all packets of shadow rays (12, 16) have in common, which tracing leaves as it is."""
+    words = rays.view(np.uint32)
+    for lane in range(16):
+        rays[3, lane] = _ZERO
+        rays[7, lane] = _ZERO
+        words[9, lane] = _INVALID
+        words[10, lane] = 0
+        words[11, lane] = 0
+
+
+@kernel
 def _trace(
     function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, run: int,
     scratch: np.ndarray, rows: np.ndarray, n: int, state: np.ndarray,
 ) -> None:  # fmt: skip
     """Shadow rays of `n` places of a run, in packets of 16; their `state` is set."""
     rays = scratch[_RAYS : _RAYS + 3].reshape(12, 16)
-    words = rays.view(np.uint32)
     valid = scratch[_RAYS + 3, :16].view(np.int32)
+    limit = np.float32(np.inf) if distant else _STOP_SHORT
     for begin in range(0, n, 16):
         count = min(16, n - begin)
         for lane in range(16):
@@ -164,12 +176,7 @@ def _trace(
             for c in range(3):
                 rays[c, lane] = place[run, c, j]
                 rays[4 + c, lane] = scratch[_TO_X + c, j]
-            rays[3, lane] = _ZERO
-            rays[7, lane] = _ZERO
-            rays[8, lane] = np.inf if distant else _STOP_SHORT
-            words[9, lane] = _INVALID
-            words[10, lane] = 0
-            words[11, lane] = 0
+            rays[8, lane] = limit
         call_packet(function, address_of(valid), opaque, address_of(rays), arguments)
         for lane in range(count):
             state[rows[begin + lane]] = _CLEAR if rays[8, lane] >= _ZERO else _BLOCKED
@@ -187,24 +194,23 @@ def _trace(
 def _meet(
     function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, run: int,
     scratch: np.ndarray, points: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, rows: np.ndarray,
-    state: np.ndarray,
+    state: np.ndarray, asks: np.ndarray,
 ) -> None:  # fmt: skip
     """Find what is between the places of a run and their points; `points` (RUN,), -1 where there is none."""
     follows = phase >= 0
-    count, sure = 0, 0
-    for j in range(RUN):
-        state[j] = _BLOCKED
-        if points[j] < 0:
-            continue
-        if follows and known[j] >> 2 == points[j]:
-            state[j] = known[j] & 3
-            sure += 1
-            if (j & (PART - 1)) != phase:
-                continue
-        elif share_rays and not follows and (j & (PART - 1)) != 0:
-            continue
-        rows[count] = j
-        count += 1
+    # Loops without branches, which the compiler turns into vectors, and one that only counts.
+    if follows:
+        for j in range(len(known)):
+            same = known[j] >> 2 == points[j]
+            state[j] = known[j] & 3 if same and points[j] >= 0 else _BLOCKED
+            asks[j] = 1 if points[j] >= 0 and (not same or (j & (PART - 1)) == phase) else 0
+        for j in range(len(known), RUN):
+            state[j], asks[j] = _BLOCKED, 0
+    else:
+        for j in range(RUN):
+            state[j] = _BLOCKED
+            asks[j] = 1 if points[j] >= 0 and (not share_rays or (j & (PART - 1)) == 0) else 0
+    count = _rows_that_ask(asks, rows)
     _trace(function, arguments, opaque, passing, distant, place, run, scratch, rows, count, state)
     alike = True
     if follows:
@@ -221,17 +227,20 @@ def _meet(
                 state[j] = common
     if alike:
         return
-    more = 0
-    done = 0
     for j in range(RUN):
-        if points[j] < 0:
-            continue
-        if done < count and rows[done] == j:
-            done += 1
-            continue
-        rows[RUN + more] = j
-        more += 1
-    _trace(function, arguments, opaque, passing, distant, place, run, scratch, rows[RUN:], more, state)
+        asks[j] = 1 if points[j] >= 0 and asks[j] == 0 else 0
+    count = _rows_that_ask(asks, rows)
+    _trace(function, arguments, opaque, passing, distant, place, run, scratch, rows, count, state)
+
+
+@kernel
+def _rows_that_ask(asks: np.ndarray, rows: np.ndarray) -> int:
+    """Numbers of the places with a 1, into `rows`; how many there are."""
+    count = np.int64(0)
+    for j in range(RUN):
+        rows[count] = j
+        count += asks[j]
+    return count
 
 
 @kernel
@@ -240,8 +249,9 @@ def _light_run(
     colors: np.ndarray, distant: bool, offset: int, shift: float, place: np.ndarray, tint: np.ndarray,
     gloss: np.ndarray, lobe: int, share_rays: bool, phase: int, known: np.ndarray, row: np.ndarray, out: np.ndarray,
     through: np.ndarray, run: int, scratch: np.ndarray, whole: np.ndarray,
+    rows: np.ndarray,
 ) -> None:  # fmt: skip
-    """`light_places` for one run; `whole` (4, RUN) int64 is scratch memory as well."""
+    """`light_places` for one run; `whole` (3, RUN) int32 and `rows` (RUN,) int64 are scratch memory as well."""
     candidates, width = points.shape[0], points.shape[2]
     start, here, size = address_of(scratch), address_of(place) + run * (PLACE * RUN * 4), min(RUN, len(row) - run * RUN)
     for lane in range(0, RUN, 16):
@@ -251,20 +261,20 @@ def _light_run(
         numbers = where_above(numbers, below_one, minus(numbers, spread(_ONE)), numbers)
         store(start + _LEVEL * RUN * 4 + lane * 4, numbers)
         _look(address_of(points) + offset * 4, width, candidates, distant, here, lane, start + _LEVEL * RUN * 4, start)
-    chosen, state, rows = whole[0], whole[1], whole[2:].reshape(2 * RUN)
-    choice = scratch[_CHOICE].view(np.int32)
+    chosen, state, asks = whole[0], whole[1], whole[2]
+    choice, first = scratch[_CHOICE].view(np.int32), first_point[offset : offset + RUN]
     for j in range(RUN):
-        chosen[j] = first_point[offset + j] + choice[j] if choice[j] >= 0 and j < size else -1
+        chosen[j] = first[j] + choice[j] if choice[j] >= 0 else -1
+    chosen[size:] = -1
     _meet(
         function, arguments, opaque, passing, distant, place, run, scratch, chosen, share_rays, phase,
-        known[run * RUN : run * RUN + size], rows, state,
+        known[run * RUN : run * RUN + size], rows, state, asks,
     )  # fmt: skip
-    lit = False
+    levels, n_lit = scratch[_LEVEL], np.int32(0)
     for j in range(RUN):
-        if state[j] == _BLOCKED:
-            scratch[_LEVEL, j] = _ZERO
-        else:
-            lit = True
+        levels[j] = levels[j] if state[j] != _BLOCKED else _ZERO
+        n_lit += state[j]
+    lit = n_lit > 0
     if not lit:
         scratch[_TO_X : _TO_Z + 1] = _ZERO
     elif lobe >= 0:
@@ -280,18 +290,22 @@ def _light_run(
                 reflects = multiply_add(load(of_lobe), load(at + _BASE * RUN * 4), reflects)
                 reflects = multiply_add(load(of_lobe + RUN * 12), load(at + _EDGE * RUN * 4), reflects)
             store(at + (_TO_X + c) * RUN * 4, product(reflects, level))
+    if len(colors) > 0:
+        for j in range(size):
+            if chosen[j] >= 0:
+                for c in range(3):
+                    scratch[_TO_X + c, j] *= colors[chosen[j], c]
+    red, green, blue, first_row = scratch[_TO_X], scratch[_TO_Y], scratch[_TO_Z], run * RUN
     for j in range(size):
-        i = run * RUN + j
-        target, k = np.int64(row[i]), chosen[j]
-        for c in range(3):
-            value = scratch[_TO_X + c, j]
-            if len(colors) > 0 and k >= 0:
-                value *= colors[k, c]
-            out[target, c] = value
-        if len(through) > 0:
-            through[i] = 1 + k if state[j] == _THROUGH else 0
-        if len(known) > 0:
-            known[i] = STATES * k + state[j] if k >= 0 else -1
+        target = np.uint64(row[first_row + j])
+        out[target, 0], out[target, 1], out[target, 2] = red[j], green[j], blue[j]
+    if len(through) > 0:
+        for j in range(size):
+            through[first_row + j] = 1 + chosen[j] if state[j] == _THROUGH else 0
+    if len(known) > 0:
+        found = known[first_row : first_row + size]
+        for j in range(size):
+            found[j] = STATES * chosen[j] + state[j] if chosen[j] >= 0 else -1
 
 
 @kernel
@@ -305,7 +319,8 @@ def _light_runs(
     storage = np.empty((_ROWS + 1) * RUN, np.float32)
     skip = np.int64((-storage.ctypes.data % 64) // 4)
     scratch = storage[skip : skip + _ROWS * RUN].reshape(_ROWS, RUN)
-    whole = np.empty((4, RUN), np.int64)
+    whole, rows = np.empty((3, RUN), np.int32), np.empty(RUN, np.int64)
+    _prepare_packet(scratch[_RAYS : _RAYS + 3].reshape(12, 16))
     for j in range(RUN):
         # multiples of the golden ratio are spread evenly, modulo 1, however many of them there are
         scratch[_NUMBERS, j] = np.float32((j * 0.6180339887498949) % 1.0)
@@ -316,7 +331,7 @@ def _light_runs(
         shift = to_unit(hash_u32(np.uint32(of_turn) ^ np.uint32(run)))
         _light_run(
             function, arguments, opaque, passing, points, first_point, colors, distant, offset, shift, place, tint,
-            gloss, np.int64(lobes[run]), share_rays, phase, known, row, out, through, run, scratch, whole,
+            gloss, np.int64(lobes[run]), share_rays, phase, known, row, out, through, run, scratch, whole, rows,
         )  # fmt: skip
 
 

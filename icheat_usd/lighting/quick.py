@@ -158,6 +158,7 @@ def direct_at(
     out: F32,
     turn: int = 0,
     last: LastLook | None = None,
+    shining: tuple[F32, bool] | None = None,
 ) -> None:
     """Light of a one-light snapshot that places reflect, one shadow ray each, into `out` (n, 3) in the points' order.
 
@@ -171,6 +172,8 @@ def direct_at(
         Without what does not block the light; see `lighting.controls.hidden_instances`.
     last : LastLook, optional
         Of the same light and turn somewhere near: most places take their shadow from it. It is brought up to date.
+    shining : (table, distant), optional
+        What `light_points` has for the snapshot and the seed, if that is known.
     """
     controls = snapshot.controls(0)
     tint, gloss = places.tint, places.gloss
@@ -179,7 +182,7 @@ def direct_at(
     if controls.specular != 1.0:
         gloss = gloss.copy()
         gloss[:, :_ALPHA] *= np.float32(controls.specular)
-    table, distant = light_points(snapshot, seed)
+    table, distant = shining or light_points(snapshot, seed)
     groups = light_groups(table, _FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
     through = np.empty(0 if shadows.passing is None else places.n, np.int32)
     function, opaque = shadows.opaque.address_of("rtcOccluded16")

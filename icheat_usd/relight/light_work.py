@@ -20,7 +20,7 @@ from icheat_usd.lighting import (
 from icheat_usd.lighting.controls import darken, hidden_instances, receives, tracer_for
 from icheat_usd.lighting.domes import BinnedSky, SeenSky, see_sky, white_sky
 from icheat_usd.lighting.guide import LITTLE, Steps
-from icheat_usd.lighting.points import has_points
+from icheat_usd.lighting.points import has_points, light_points
 from icheat_usd.lighting.quick import LastLook, Places, Shadows, build_shadows, direct_at, prepare_places
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
@@ -247,6 +247,7 @@ class MovingLight:
         self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
     ) -> None:
         self._around, self._alone, self._seed, self._rounds = around, alone, seed, light_samples
+        self._shining = light_points(alone, seed)
         self._step = self._n_found = 0
         self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
@@ -263,10 +264,10 @@ class MovingLight:
         assert around.cells is not None and around.tiles is not None
         direct = np.empty((around.gather.n, 3), np.float32)
         shadows = around.shadows_of(self._alone)
-        direct_at(self._alone, shadows, around.cells, self._seed, False, direct, last=last.cells)
+        direct_at(self._alone, shadows, around.cells, self._seed, False, direct, 0, last.cells, self._shining)
         around.bounce(direct, radiance, self.direct, last.next_part())
         self.direct = direct
-        direct_at(self._alone, shadows, around.tiles, self._seed, True, view_direct, last=last.view)
+        direct_at(self._alone, shadows, around.tiles, self._seed, True, view_direct, 0, last.view, self._shining)
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """Another round at the cells or at the view; False after the last."""
@@ -285,7 +286,8 @@ class MovingLight:
             return self._find_highlights(view_direct)
         places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
         found = np.empty((places.n, 3), np.float32)
-        direct_at(self._alone, around.shadows_of(self._alone), places, self._seed, False, found, turn)
+        shadows = around.shadows_of(self._alone)
+        direct_at(self._alone, shadows, places, self._seed, False, found, turn, shining=self._shining)
         into += found if at_view else around.cell_means(found)
         share = np.float32(1.0 / (turn + 1))
         if at_view:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import numpy as np
 
 from icheat_usd.kernels.residuals import add_light_residuals, proportions
@@ -69,10 +71,8 @@ class Narrow:
         factors = np.zeros((len(self._known), 4 * 16), np.float32)
         n = min(len(radiance), len(factors))
         factors[:n] = np.tile(np.pad(gains[:n], ((0, 0), (0, 1))), (1, 16))
-        rest = np.zeros(radiance.shape[1:], np.float32)
-        for light in np.flatnonzero(~is_same).tolist():
-            rest += self._rest(light, radiance[light], factors) * gains[light]
-
+        changed = np.flatnonzero(~is_same).tolist()
+        parts = [self._rest(light, radiance[light], gains[light], factors) for light in changed]
         n_tiles = self._exact.n_tiles
         every = np.arange(n_tiles, dtype=np.int32)
 
@@ -87,6 +87,7 @@ class Narrow:
             add(out, every)
             self._products.see(out, every)
         else:
+            rest = reduce(np.add, parts) if parts else np.zeros(radiance.shape[1:], np.float32)
             self._products.multiply_all(rest, out, known=add)
 
     def products_of(self, light: int) -> F32:
@@ -94,15 +95,16 @@ class Narrow:
         found: F32 = self._known[light].reshape(-1, self._exact.n_tiles, LANES, 4)
         return found
 
-    def _rest(self, light: int, radiance: F32, factors: F32) -> F32:
-        """What of a light is not like it was at rest; what is goes to `factors`."""
+    def _rest(self, light: int, radiance: F32, gain: F32, factors: F32) -> F32:
+        """What of a light under a gain is not like it was at rest; what is goes to `factors`."""
         if light >= len(factors):
-            return radiance
+            return radiance * gain
         begin = np.arange(0, len(radiance), _PIECE)
         pieces: I64 = np.stack([0 * begin, begin, np.minimum(begin + _PIECE, len(radiance))], axis=1)
         share, rest = np.zeros((1, 4 * 16), np.float32), np.empty_like(radiance)
         proportions(pieces, radiance, self._radiance[light], share, rest, np.zeros((1, 2), np.float32))
         factors[light] *= share[0]
+        rest *= gain
         return rest
 
     def _compare(self, radiance: F32) -> Bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icheat_usd.kernels import quick_bounces as kernels
 from icheat_usd.samples import ClusterTree
@@ -35,7 +36,7 @@ class QuickBounces:
     Light `g` after all bounces balances ``g = d + A R g`` (d direct light, A albedo, R rows). A step adds what
     is missing, ``r = d + A R g - g`` with the exact rows, and what becomes of `r` in further bounces between
     clusters: an iteration with a preconditioner [1]_, which gains a factor of two to ten per step. Weights
-    are rounded by at most 0.4 % each at 65,536 cells, of either sign.
+    are rounded by at most 0.4 % each at 65,536 cells, of either sign, and so is the light that they reach.
 
     .. [1] Saad 2003, Iterative Methods for Sparse Linear Systems, section 9.
     """
@@ -49,6 +50,7 @@ class QuickBounces:
     blocks: F32  #: later bounces, between clusters and per colour: see `kernels.quick_bounces.reach_clusters`
     lasting: bool  #: whether there are enough bounces for a balance
     scratch: F32  #: (2, n_gather, 4) for `solve` and `follow`, which thus serve one thread at a time
+    short: NDArray[np.uint64]  #: (n_gather,) as well, for light that rows reach
 
     def solve(self, direct: F32, out: F32 | None = None) -> F32:
         """Approximation of `solve_bounces` for one light: (n_gather, 3) to (n_gather, 3)."""
@@ -94,7 +96,9 @@ class QuickBounces:
     def _take_change(self, radiance: F32, before: F32, direct: F32) -> tuple[F32, F32]:
         """Mean change of each cluster (3, n_clusters), and the sizes of all change and of all direct light."""
         leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 2), np.float32)
-        kernels.take_change(self.begin, self.share, radiance, before, direct, self.scratch[0], leaves, sizes)
+        kernels.take_change(
+            self.begin, self.share, radiance, before, direct, self.scratch[0], self.short, leaves, sizes
+        )
         return leaves, sizes.sum(axis=0)
 
     def _step(self, direct: F32, part: tuple[int, int], out: F32) -> F32:
@@ -104,7 +108,18 @@ class QuickBounces:
         arriving = np.empty((self.n_clusters, 3), np.float32)
         rows = self.indptr, self.entries, self.column_bits
         kernels.find_missing(
-            self.begin, self.share, *rows, direct, light, self.albedo, *part, missing, arriving, leaves, sizes
+            self.begin,
+            self.share,
+            *rows,
+            direct,
+            light,
+            self.short,
+            self.albedo,
+            *part,
+            missing,
+            arriving,
+            leaves,
+            sizes,
         )
         self._add(leaves, arriving, part, out)
         return np.asarray(sizes.sum(axis=0))
@@ -115,7 +130,7 @@ class QuickBounces:
         kernels.reach_clusters(self.blocks, leaves, later)
         light, missing = self.scratch
         here, missing = (later, missing[:0]) if here is None else (here, missing)
-        kernels.add_missing(self.begin, self.albedo, missing, here, later, *part, light, out)
+        kernels.add_missing(self.begin, self.albedo, missing, here, later, *part, light, self.short, out)
 
     @property
     def n_clusters(self) -> int:
@@ -158,6 +173,7 @@ def build_quick_bounces(
         _in_blocks(matrices),
         n_bounces >= _LASTING,
         np.zeros((2, tree.n_leaves, 4), np.float32),
+        np.zeros(tree.n_leaves, np.uint64),
     )
 
 
