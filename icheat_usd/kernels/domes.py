@@ -9,6 +9,7 @@ from numba import prange
 
 from icheat_usd.kernels._jit import parallel_kernel
 from icheat_usd.kernels.environment import Table, dome_lookup
+from icheat_usd.kernels.simd import address_of, black, color_of, color_product, load_color, scale_add, store_rgb
 
 ROWS, COLUMNS = 64, 128  #: bins of equal solid angle: bands of equal height, cut by longitude
 _BLOCK, _BINS = 256, 64  # of a task
@@ -38,7 +39,7 @@ def bin_sky(
     radiance : (3,) float32
     to_local : (3, 3) float64, from the world to the dome
     directions : (n_bins, n_looks, 3) float32, world space, any length
-    out : (n_bins, 3) float32
+    out : (n_bins, 4) float32, set but for the pad
     """
     for block in prange((len(out) + _BINS - 1) // _BINS):
         for i in range(block * _BINS, min(len(out), (block + 1) * _BINS)):
@@ -80,30 +81,22 @@ def shine(
     bins : (n_entries,) uint16
     diffuse : (n_entries,) float32, irradiance per radiance
     glossy : (n_entries,) float32, reflected radiance per radiance; or empty
-    sky : (n_bins, 3) float32, radiance
+    sky : (n_bins, 4) float32, radiance and a pad
     tint, gloss_tint : (n, 3) float32
         Albedo over pi; colour of the specular lobe.
-    out : (n, 3) float32, reflected radiance
+    out : (n, 3) float32, contiguous, reflected radiance
     """
-    has_gloss = len(glossy) > 0
+    has_gloss, colors, light = len(glossy) > 0, address_of(sky), address_of(out)
     for block in prange((len(out) + _BLOCK - 1) // _BLOCK):
         for i in range(block * _BLOCK, min(len(out), (block + 1) * _BLOCK)):
-            r0, g0, b0 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            r1, g1, b1 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            matte, shiny = black(), black()
             for e in range(begin[i], begin[i + 1]):
-                j, w = bins[e], diffuse[e]
-                r0 += w * sky[j, 0]
-                g0 += w * sky[j, 1]
-                b0 += w * sky[j, 2]
+                color = load_color(colors + np.int64(bins[e]) * 16)
+                matte = scale_add(color, diffuse[e], matte)
                 if has_gloss:
-                    w = glossy[e]
-                    r1 += w * sky[j, 0]
-                    g1 += w * sky[j, 1]
-                    b1 += w * sky[j, 2]
-            out[i, 0] = r0 * tint[i, 0]
-            out[i, 1] = g0 * tint[i, 1]
-            out[i, 2] = b0 * tint[i, 2]
+                    shiny = scale_add(color, glossy[e], shiny)
+            matte = color_product(matte, color_of(tint[i, 0], tint[i, 1], tint[i, 2]))
             if has_gloss:
-                out[i, 0] += r1 * gloss_tint[i, 0]
-                out[i, 1] += g1 * gloss_tint[i, 1]
-                out[i, 2] += b1 * gloss_tint[i, 2]
+                shiny = color_product(shiny, color_of(gloss_tint[i, 0], gloss_tint[i, 1], gloss_tint[i, 2]))
+                matte = scale_add(shiny, np.float32(1.0), matte)
+            store_rgb(light + i * 12, matte)

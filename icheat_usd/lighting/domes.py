@@ -34,7 +34,7 @@ class SeenSky:
     gloss_tint: F32  #: (n, 3) colour of the specular lobe
 
     def light(self, sky: F32, out: F32, controls: LightControls = PLAIN) -> None:
-        """Reflected light of a binned sky (n_bins, 3), into `out` (n, 3)."""
+        """Reflected light of a binned sky (n_bins, 4), into `out` (n, 3), which is contiguous."""
         tint, gloss_tint = self.tint, self.gloss_tint
         if controls.diffuse != 1.0:
             tint = tint * np.float32(controls.diffuse)
@@ -160,8 +160,8 @@ class BinnedSky:
         self._texture = none if row < 0 else append_texture(none, _smaller(texture_image(alone.textures, row)))[0]
 
     def under(self, alone: SceneSnapshot) -> F32:
-        """Mean radiance of each bin as the dome stands in `alone`, (n_bins, 3)."""
-        out = np.zeros((kernels.ROWS * kernels.COLUMNS, 3), np.float32)
+        """Mean radiance of each bin as the dome stands in `alone`, and 0: (n_bins, 4)."""
+        out = np.zeros((kernels.ROWS * kernels.COLUMNS, 4), np.float32)
         linear = alone.lights.to_world[0, :, :3].astype(np.float64)
         if np.linalg.det(linear) != 0.0:
             to_local = np.ascontiguousarray(np.linalg.inv(linear))

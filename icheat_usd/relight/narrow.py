@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from functools import reduce
-
 import numpy as np
 
+from icheat_usd.kernels.assemble import sum_scaled
 from icheat_usd.kernels.residuals import add_light_residuals, proportions
 from icheat_usd.relight.products import Products
 from icheat_usd.scene import F32, I32, I64, Bool
@@ -71,8 +70,6 @@ class Narrow:
         factors = np.zeros((len(self._known), 4 * 16), np.float32)
         n = min(len(radiance), len(factors))
         factors[:n] = np.tile(np.pad(gains[:n], ((0, 0), (0, 1))), (1, 16))
-        changed = np.flatnonzero(~is_same).tolist()
-        parts = [self._rest(light, radiance[light], gains[light], factors) for light in changed]
         n_tiles = self._exact.n_tiles
         every = np.arange(n_tiles, dtype=np.int32)
 
@@ -87,7 +84,10 @@ class Narrow:
             add(out, every)
             self._products.see(out, every)
         else:
-            rest = reduce(np.add, parts) if parts else np.zeros(radiance.shape[1:], np.float32)
+            rest = np.empty(radiance.shape[1:], np.float32)
+            sum_scaled(radiance[n:], gains[n:], rest)
+            for light in np.flatnonzero(~is_same[:n]).tolist():
+                rest += self._rest(light, radiance[light], gains[light], factors)
             self._products.multiply_all(rest, out, known=add)
 
     def products_of(self, light: int) -> F32:
@@ -96,9 +96,7 @@ class Narrow:
         return found
 
     def _rest(self, light: int, radiance: F32, gain: F32, factors: F32) -> F32:
-        """What of a light under a gain is not like it was at rest; what is goes to `factors`."""
-        if light >= len(factors):
-            return radiance * gain
+        """What of a light under a gain is not like it was at rest; what is like it goes to `factors`."""
         begin = np.arange(0, len(radiance), _PIECE)
         pieces: I64 = np.stack([0 * begin, begin, np.minimum(begin + _PIECE, len(radiance))], axis=1)
         share, rest = np.zeros((1, 4 * 16), np.float32), np.empty_like(radiance)

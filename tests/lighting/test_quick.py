@@ -180,7 +180,7 @@ def test_a_turned_dome_shines_as_the_general_sampler_says() -> None:
 def test_an_even_sky_fills_every_bin_alike() -> None:
     snapshot = make_snapshot([Mesh(quad())], lights=[Light(LightKind.DOME, (1, 2, 3), IDENTITY)])
     sky = BinnedSky(snapshot).under(snapshot)
-    np.testing.assert_allclose(sky, np.broadcast_to((1, 2, 3), sky.shape))
+    np.testing.assert_allclose(sky, np.broadcast_to((1, 2, 3, 0), sky.shape))
 
 
 def test_images_of_lights_follow_one_another() -> None:
