@@ -158,6 +158,8 @@ def list_command(options: argparse.Namespace) -> int:
 
 def as_text(listed: Any) -> str:
     """The keys of an edit for people: one line each, after one about all of them."""
+    from icheat_usd.edits.staleness import value_text
+
     if not listed.keys:
         return f"{listed.edit} has no keys"
     lines = [f"{listed.edit}  {listed.interpolation}  decided by {listed.layer}"]
@@ -166,8 +168,9 @@ def as_text(listed: Any) -> str:
         lines.append(f"  copied from {listed.copied_from}, {state}")
     for key in listed.keys:
         time = "always" if key.time is None else f"{key.time:g}"
-        what = f"{key.payload[:12]}  {key.file}{'' if key.is_found else '  (missing)'}" if key.payload else "identity"
-        lines.append(f"  {time:>8}  {what}")
+        what = f"{key.payload[:12]}  {key.file}{'' if key.is_found else '  (missing)'}" if key.payload else ""
+        said = " ".join(f"{name}={value_text(value)}" for name, value in key.parameters.items())
+        lines.append("  ".join(filter(None, (f"  {time:>8}", said if key.payload else "identity", what))))
     return "\n".join(lines)
 
 

@@ -43,8 +43,10 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--single-part", action="store_true", help="all layers in one part of an .exr")
     parser.add_argument("--force", action="store_true", help="render frames again that are there already")
-    parser.add_argument("--samples", type=positive, metavar="N", help="camera samples a pixel")
-    parser.add_argument("--edge-samples", type=at_least_0, metavar="N", help="more of them in pixels that hold edges")
+    parser.add_argument("--samples", type=positive, metavar="N", help="camera samples a pixel; default 4")
+    parser.add_argument(
+        "--edge-samples", type=at_least_0, metavar="N", help="more of them in pixels with edges; default 12"
+    )
     parser.add_argument("--filter", metavar="NAME", help="box, triangle, gaussian or blackman-harris; default box")
     parser.add_argument("--filter-width", type=float, metavar="PIXELS", help="of its support; default the usual one")
     parser.add_argument(
@@ -66,8 +68,10 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--denoise", action="store_true", help="with Open Image Denoise: pip install 'icheat-usd[denoise]'"
     )
-    parser.add_argument("--rays", type=positive, metavar="N", help="gather rays where no light is cached")
-    parser.add_argument("--bounces", type=positive, metavar="N", help="diffuse reflections before the last one")
+    parser.add_argument("--rays", type=positive, metavar="N", help="gather rays where no light is cached; default 64")
+    parser.add_argument(
+        "--bounces", type=positive, metavar="N", help="diffuse reflections before the last one; default 16"
+    )
 
 
 def at_least_0(text: str) -> int:

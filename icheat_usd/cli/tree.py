@@ -84,6 +84,7 @@ def _payloads_as_json(how: str, states: Any) -> dict[str, Any]:
             "time": state.time,
             "digest": state.digest,
             "file": state.file,
+            "parameters": dict(state.parameters),
             "elements": list(state.elements),
             "storedBytes": state.stored_bytes,
             "stale": list(state.stale),
@@ -131,7 +132,8 @@ def _details(edit: Any, states: Any) -> list[str]:
             lines.append(f"payload {at}: none, the identity")
         else:
             held = f"  ({', '.join(state.elements)})" if state.elements else ""
-            lines.append(f"payload {at}: {state.digest[:12]} in {os.path.basename(state.file)}{held}")
+            values = "".join(f"{name}={_text(value)}, " for name, value in state.parameters.items())
+            lines.append(f"payload {at}: {values}{state.digest[:12]} in {os.path.basename(state.file)}{held}")
         lines += [f"  stale: {reason}" for reason in state.stale]
         lines += [f"  note: {note}" for note in state.notes]
         lines += [f"  problem: {state.problem}"] if state.problem else []

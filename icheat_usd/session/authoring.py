@@ -16,12 +16,14 @@ from icheat_usd.edits.operations.base import plain_values
 from icheat_usd.edits.operations.constants import BakedConstants, baked_constants
 from icheat_usd.errors import EditError
 from icheat_usd.scene import Finding
+from icheat_usd.session.key_values import hidden_keys
 from icheat_usd.session.origin import history_entry
 from icheat_usd.sidecar import read_payload as read_sidecar
 from icheat_usd.sidecar import write_payloads
 from icheat_usd.stage import authoring, collections, schema
 from icheat_usd.stage.authoring import Members
 from icheat_usd.stage.layers import saving
+from icheat_usd.stage.variants import selected_variant
 
 
 def read_payload(file: str, source: str | bytes, digest: str, anchor: str) -> Payload:
@@ -154,7 +156,13 @@ def add_edit(
 
 
 def set_edit(stage: Any, edit: str, *, layer: str, **values: Any) -> tuple[Finding, ...]:
-    """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`."""
+    """Change values of an edit in one layer and save it; see `stage.authoring.set_edit`.
+
+    Returns
+    -------
+    tuple of Finding
+        What was authored without effect, and what hides different values of the edit's keys from now on.
+    """
     if values.get("parameters"):
         values["parameters"] = plain_values(values["parameters"])
     operation = values.get("operation")
@@ -162,7 +170,9 @@ def set_edit(stage: Any, edit: str, *, layer: str, **values: Any) -> tuple[Findi
         # A baked payload would go on acting as before, under a name that somebody misspelt.
         raise authoring.unknown_operation(edit, operation)
     with saving(stage, layer):
-        return authoring.set_edit(stage, edit, layer=layer, **values)
+        findings = authoring.set_edit(stage, edit, layer=layer, **values)
+    with selected_variant(stage, edit, values.get("variant")):
+        return (*findings, *hidden_keys(stage, edit, values.get("parameters") or ()))
 
 
 def mute_edit(

@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     from icheat_usd.session.replaying import FrameReplay
 
 
+_NO_LIGHTS = Finding(
+    "/", "lights", "the stage shows no light at this time, so all is black; check visibility and payloads"
+)
+
+
 class Session(ShotParts):
     """One stage seen by one camera at one time, with one edit stack.
 
@@ -178,9 +183,10 @@ class Session(ShotParts):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What the stage has and is not supported, and what is wrong with its edits."""
+        """What the stage has and is not supported, and what is wrong with its lights and edits."""
         stack, findings = self._read_stack()
-        return self.snapshot.findings + findings + bind(stack, self.snapshot).findings
+        dark = () if self.snapshot.light_paths else (_NO_LIGHTS,)
+        return self.snapshot.findings + dark + findings + bind(stack, self.snapshot).findings
 
     # Images
 

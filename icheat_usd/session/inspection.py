@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from icheat_usd.scene import Finding
 from icheat_usd.session.authoring import read_payload
 from icheat_usd.stage import open_stage, schema
+from icheat_usd.stage.camera import named_settings_findings
 from icheat_usd.stage.check import RULES, Context, check_stage, findings_of
 from icheat_usd.stage.check.selections import EmptySelection, UnshadowWithoutOccluders
 from icheat_usd.stage.description import EditDescription, describe_edit
@@ -67,7 +68,7 @@ def describe_stack(stage: Any, path: str, frame: float | None = None) -> StackDe
 
 def check(stage: Any, frame: float | None = None) -> tuple[Finding, ...]:
     """Everything wrong with a stage's composition and its edits; every payload is read."""
-    return (*composition_findings(stage), *check_stage(stage, frame, read_payload))
+    return (*composition_findings(stage), *named_settings_findings(stage), *check_stage(stage, frame, read_payload))
 
 
 def included(stage: Any, edit: str, side: str, variant: tuple[str, str] | None = None) -> tuple[tuple[str, ...], str]:

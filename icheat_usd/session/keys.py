@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,11 @@ from icheat_usd.edits import operations
 from icheat_usd.edits.model import MaskedSurface, Payload, SurfaceMask, Value
 from icheat_usd.edits.operations.base import plain_values
 from icheat_usd.edits.operations.constants import baked_constants
-from icheat_usd.errors import EditError
+from icheat_usd.edits.staleness import value_text
+from icheat_usd.errors import EditError, SidecarError
 from icheat_usd.scene import F32, F64, Finding
 from icheat_usd.session.authoring import read_payload
+from icheat_usd.session.key_values import parameters_at
 from icheat_usd.session.origin import history_entry
 from icheat_usd.sidecar import write_payloads
 from icheat_usd.stage import key_authoring, layers, schema
@@ -35,6 +37,7 @@ class ListedKey:
     payload: str  #: digest, "" for the identity
     file: str  #: where its sidecar was looked for, "" for the identity
     is_found: bool
+    parameters: Mapping[str, Value] = field(default_factory=dict)  #: that hold there; none where they cannot be read
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,17 @@ def list_keys(stage: Any, edit: str) -> KeyList:
     if track is None:
         return KeyList(edit, (), schema.read_attribute(prim, schema.KEY_INTERPOLATION, None), "", "", True)
     copied_from, is_current = key_authoring.copied_keys_are_current(prim) or ("", True)
-    keys = tuple(ListedKey(key.time, key.digest, key.anchored, bool(key.resolved)) for key in track.keys)
+    keys = tuple(
+        ListedKey(key.time, key.digest, key.anchored, bool(key.resolved), _parameters(prim, key)) for key in track.keys
+    )
     return KeyList(edit, keys, track.interpolation.value, track.layer, copied_from, is_current)
+
+
+def _parameters(prim: Any, key: Key) -> dict[str, Value]:
+    try:
+        return parameters_at(prim, key) if key.digest else {}
+    except (EditError, SidecarError):
+        return {}
 
 
 def set_key(
@@ -300,6 +312,10 @@ class _Made:
             payload = self._read(key)
             values = {name: authored[name] for name in self._newly_keyed if name in authored}
             others[key.time] = self._baked(replace(payload, parameters={**payload.parameters, **values}, rows=None))
+            changed = [name for name in values if values[name] != payload.parameters.get(name)]
+            for name in changed:
+                message = f"was {value_text(values[name])} at all frames, so the key at {key.time:g} has that now"
+                self.findings.append(EditFinding(str(self.prim.GetPath()), self._names[name], message))
         return others
 
     def released(self) -> list[str]:

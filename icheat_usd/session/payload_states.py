@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from icheat_usd.edits import operations
+from icheat_usd.edits.model import Value
 from icheat_usd.edits.operations.base import Level
 from icheat_usd.edits.operations.constants import baked_constants
 from icheat_usd.errors import EditError, IcheatError
@@ -35,6 +36,7 @@ class PayloadState:
     stale: tuple[str, ...] = ()  #: what has changed since it was painted or baked
     notes: tuple[str, ...] = ()  #: what has changed and leaves it usable
     problem: str = ""  #: why it cannot be read
+    parameters: Mapping[str, Value] = field(default_factory=dict)
 
 
 def payload_states(
@@ -93,6 +95,7 @@ def _states(context: Context, edit: EditDescription, scene: bool) -> Iterator[Pa
             sum(info.stored_bytes for info in infos),
             tuple(_stale(context, prim, key, payload, scene)),
             tuple(_notes(context, prim, key, payload, scene)),
+            parameters=payload.parameters,
         )
 
 

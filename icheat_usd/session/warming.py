@@ -30,7 +30,7 @@ LIST = Path(kernels.__file__).with_name("signatures.json")
 #: What kernels are compiled for.
 PURPOSES = ("live", "relight", "render")
 
-STEP = "compiling kernels, once for this machine"
+STEP = "compiling kernels that this machine has not used yet"
 
 _MOST_JOBS = 16  # the longest chain of callers takes as long as sixteen processes take for all others
 

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom, UsdRender
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender
 
 from icheat_usd.errors import StageError
-from icheat_usd.scene import F64, Camera
+from icheat_usd.scene import F64, Camera, Finding
 from icheat_usd.stage.transforms import Placement, from_gf
 
 DEFAULT_WIDTH = 640
@@ -69,12 +69,26 @@ def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode, product: str | Non
     )
 
 
+def named_settings_findings(stage: Usd.Stage) -> tuple[Finding, ...]:
+    """A finding where the stage names render settings that are none: nothing of them counts."""
+    named = stage.GetMetadata("renderSettingsPrimPath")
+    if not named or UsdRender.Settings.GetStageRenderSettings(stage):
+        return ()
+    prim = stage.GetPrimAtPath(named) if Sdf.Path.IsValidPathString(named) else None
+    what = f"is a {prim.GetTypeName() or 'typeless prim'} and no RenderSettings" if prim else "does not exist"
+    message = f"{named} {what}, so camera, resolution and products are not taken from it."
+    return (Finding("/", "renderSettingsPrimPath", message),)
+
+
 def _pixels(settings: UsdRender.Settings, resolution: object) -> tuple[int, int]:
     try:
         width, height = (int(size) for size in resolution)  # type: ignore[attr-defined]
-        return width, height
     except (TypeError, ValueError) as problem:
         raise StageError(f"{settings.GetPath()}: resolution is no int2; author a width and a height.") from problem
+    if min(width, height) < 1:
+        message = f"{settings.GetPath()}: resolution is {width} x {height}; author a width and a height of at least 1."
+        raise StageError(message)
+    return width, height
 
 
 def _number(settings: UsdRender.Settings, value: object) -> float:
@@ -130,10 +144,10 @@ def image_size(
         if value is not None and value < 1:
             raise StageError(f"The image's {name} is {value}; give at least 1 pixel.")
     if width is None and height is None:
-        if choices.resolution is not None and min(choices.resolution) >= 1:
+        if choices.resolution is not None:
             return choices.resolution
         return DEFAULT_WIDTH, max(1, round(DEFAULT_WIDTH / aperture_aspect))
-    sizes = choices.resolution if choices.resolution and min(choices.resolution) >= 1 else None
+    sizes = choices.resolution
     aspect = sizes[0] / sizes[1] if sizes else aperture_aspect
     if width is None:
         assert height is not None

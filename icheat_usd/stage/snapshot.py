@@ -10,7 +10,13 @@ from pxr import Usd, UsdGeom
 from icheat_usd.errors import StageError
 from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import SceneSnapshot
-from icheat_usd.stage.camera import find_camera, frame_camera, read_camera, read_render_choices
+from icheat_usd.stage.camera import (
+    find_camera,
+    frame_camera,
+    named_settings_findings,
+    read_camera,
+    read_render_choices,
+)
 from icheat_usd.stage.instancing import InstancerReader
 from icheat_usd.stage.light_controls import read_controls
 from icheat_usd.stage.light_tags import read_light_tags
@@ -79,6 +85,8 @@ def take_snapshot(
     report = Reporter()
     with quiet_usd():
         choices = read_render_choices(stage, when, product)
+        report.extend(named_settings_findings(stage))
+        _check_range(stage, time, report)
         wanted = None if camera is None else str(camera)
         camera_prim = None if wanted == AUTO_CAMERA else find_camera(stage, wanted, choices)
         report.extend(composition_findings(stage))
@@ -150,6 +158,16 @@ def take_snapshot(
 
 def _start_time(stage: Usd.Stage) -> float | None:
     return float(stage.GetStartTimeCode()) if stage.HasAuthoredMetadata("startTimeCode") else None
+
+
+def _check_range(stage: Usd.Stage, time: float | None, report: Reporter) -> None:
+    """Report a frame that the stage does not claim to have: what is animated holds there."""
+    if time is None or not stage.HasAuthoredTimeCodeRange():
+        return
+    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    if first <= last and not first <= time <= last:
+        message = f"frame {time:g} lies outside of the stage's frames {first:g}:{last:g}, beyond which animation holds."
+        report("/", "time", message)
 
 
 def _meters_per_unit(stage: Usd.Stage, report: Reporter) -> float:

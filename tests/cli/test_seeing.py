@@ -86,7 +86,8 @@ def test_tree_as_json_keeps_its_keys(shot: Path, capsys: pytest.CaptureFixture[s
     warm, grey = content["edits"]
     assert TREE_KEYS <= set(warm) and (warm["encoding"], grey["encoding"]) == ("rank-1", "recipe")
     (payload,) = warm["payloads"]
-    assert set(payload) == {"time", "digest", "file", "elements", "storedBytes", "stale", "notes", "problem"}
+    keys = {"time", "digest", "file", "parameters", "elements", "storedBytes", "stale", "notes", "problem"}
+    assert set(payload) == keys and payload["parameters"]["gain"] == 3.0
     assert payload["time"] == 1.0 and payload["storedBytes"] > 100 and payload["stale"] == []
     assert warm["amount"]["value"] == 0.5 and warm["amount"]["layer"].endswith("shot.usda")
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icheat_usd.cli import main
 from icheat_usd.errors import ImageError
 from icheat_usd.resources import resource_path
 from icheat_usd.session import GatherSettings, Quality, Session
@@ -20,6 +21,20 @@ EFFORT = GatherSettings(samples_per_pixel=2, edge_samples=0)
 @pytest.fixture(scope="module")
 def session() -> Session:
     return Session.open(BOX, width=24, height=24, quality=Quality(n_gather=4096, rays_per_bounce_row=64))
+
+
+def test_help_states_the_defaults_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", "--help"]) == 0
+    text, usual = " ".join(capsys.readouterr().out.split()), GatherSettings()
+    for said in (
+        f"camera samples a pixel; default {usual.samples_per_pixel} ",
+        f"pixels with edges; default {usual.edge_samples} ",
+        f"no light is cached; default {usual.gather_rays} ",
+        f"before the last one; default {usual.n_bounces}",
+        f"rays are traced; default {usual.cache.noise} ",
+        f"default {usual.pixel_filter} ",
+    ):
+        assert said in f"{text} ", said
 
 
 def test_photons_give_the_light_that_the_cells_give(session: Session) -> None:

@@ -143,6 +143,21 @@ def test_a_key_beside_the_identity_is_at_full_strength_and_a_finding(stage: Usd.
     assert "identity" in finding.message and gains(stage, 6) == gains(stage, 1)
 
 
+def test_a_value_for_all_frames_says_which_keys_it_hides(stage: Usd.Stage) -> None:
+    keys.set_key(stage, WARM, layer="seq.usda", frame=1, parameters={"gain": 1.0})
+    keys.set_key(stage, WARM, layer="seq.usda", frame=11, parameters={"gain": 4.0})
+    assert [key.parameters["gain"] for key in keys.list_keys(stage, WARM).keys] == [1.0, 4.0]
+    assert authoring.set_edit(stage, WARM, layer="shot.usda", amount=0.5) == ()
+    # The colour is the same at both keys, so that nothing is lost.
+    assert authoring.set_edit(stage, WARM, layer="shot.usda", parameters={"color": (1.0, 0.5, 1.0)}) == ()
+    (finding,) = authoring.set_edit(stage, WARM, layer="shot.usda", parameters={"gain": 2.0})
+    assert finding.feature == "icheat:scale:gain" and "hides the keys at 1, 11" in finding.message
+    assert [key.parameters["gain"] for key in keys.list_keys(stage, WARM).keys] == [2.0, 2.0]
+    (told,) = keys.set_key(stage, WARM, layer="shot.usda", frame=1, parameters={"gain": 1.0})
+    assert "was 2 at all frames, so the key at 11 has that now" in told.message
+    assert [key.parameters["gain"] for key in keys.list_keys(stage, WARM).keys] == [1.0, 2.0]
+
+
 def test_identity_keys_and_interpolations(stage: Usd.Stage) -> None:
     keys.set_key(stage, WARM, layer="seq.usda", frame=1)
     keys.set_key(stage, WARM, layer="seq.usda", frame=11, identity=True, interpolation="smooth")

@@ -8,7 +8,15 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender
 
 from icheat_usd.errors import StageError
 from icheat_usd.scene import Camera
-from icheat_usd.stage.camera import RenderChoices, conform, find_camera, frame_camera, read_camera, read_render_choices
+from icheat_usd.stage.camera import (
+    RenderChoices,
+    conform,
+    find_camera,
+    frame_camera,
+    named_settings_findings,
+    read_camera,
+    read_render_choices,
+)
 from icheat_usd.stage.transforms import Placement
 
 NOW = Usd.TimeCode.EarliestTime()
@@ -165,6 +173,28 @@ def test_render_settings_choose_camera_size_and_policy_and_a_product_overrides_t
     settings.CreateProductsRel().SetTargets([Sdf.Path("/Render/product")])
     choices = read_render_choices(stage, NOW)
     assert choices.camera == "/one" and choices.resolution == (64, 32) and choices.conform == "cropAperture"
+
+
+def test_settings_that_the_stage_names_and_that_are_none_are_found() -> None:
+    stage = stage_with("one")
+    assert named_settings_findings(stage) == ()
+    for named, problem in (("/Render/gone", "does not exist"), ("/one", "is a Camera")):
+        stage.SetMetadata("renderSettingsPrimPath", named)
+        (finding,) = named_settings_findings(stage)
+        assert finding.feature == "renderSettingsPrimPath" and f"{named} {problem}" in finding.message
+    UsdRender.Settings.Define(stage, "/Render/gone")
+    stage.SetMetadata("renderSettingsPrimPath", "/Render/gone")
+    assert named_settings_findings(stage) == ()
+
+
+@pytest.mark.parametrize("resolution", [(0, 100), (320, -3)])
+def test_a_resolution_without_pixels_is_an_error(resolution: tuple[int, int]) -> None:
+    stage = stage_with("one")
+    settings = UsdRender.Settings.Define(stage, "/Render/settings")
+    settings.CreateResolutionAttr().Set(Gf.Vec2i(*resolution))
+    stage.SetMetadata("renderSettingsPrimPath", "/Render/settings")
+    with pytest.raises(StageError, match=f"/Render/settings: resolution is {resolution[0]} x {resolution[1]}"):
+        read_render_choices(stage, NOW)
 
 
 def test_the_default_size_follows_the_aperture() -> None:
