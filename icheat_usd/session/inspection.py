@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from icheat_usd.scene import Finding
 from icheat_usd.session.authoring import read_payload
+from icheat_usd.session.products import product_findings
 from icheat_usd.stage import open_stage, schema
 from icheat_usd.stage.camera import named_settings_findings
 from icheat_usd.stage.check import RULES, Context, check_stage, findings_of
@@ -67,8 +68,9 @@ def describe_stack(stage: Any, path: str, frame: float | None = None) -> StackDe
 
 
 def check(stage: Any, frame: float | None = None) -> tuple[Finding, ...]:
-    """Everything wrong with a stage's composition and its edits; every payload is read."""
-    return (*composition_findings(stage), *named_settings_findings(stage), *check_stage(stage, frame, read_payload))
+    """Everything wrong with a stage's composition, its edits and its render products; every payload is read."""
+    settings = (*named_settings_findings(stage), *product_findings(stage, frame))
+    return (*composition_findings(stage), *settings, *check_stage(stage, frame, read_payload))
 
 
 def included(stage: Any, edit: str, side: str, variant: tuple[str, str] | None = None) -> tuple[tuple[str, ...], str]:

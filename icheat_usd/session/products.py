@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from icheat_usd.errors import ImageError
+from icheat_usd.errors import ImageError, StageError
 from icheat_usd.scene import Finding
 from icheat_usd.session import layer_names
 from icheat_usd.session.rendering import Output
-from icheat_usd.stage.render_products import RenderProduct, RenderVariable
+from icheat_usd.stage.render_products import RenderProduct, RenderVariable, names_products, read_render_products
+from icheat_usd.stage.stacks import EditFinding, Severity
 
 
 def product_output(product: RenderProduct) -> tuple[Output, tuple[Finding, ...]]:
@@ -52,6 +54,27 @@ def product_output(product: RenderProduct) -> tuple[Output, tuple[Finding, ...]]
         )
     output = Output(file, tuple(layers.values()), frozenset(half), product=product.path)
     return output, tuple(findings)
+
+
+def product_findings(stage: Any, frame: float | None = None) -> tuple[Finding, ...]:
+    """What would keep the products of the stage's render settings from being written, and what is not supported."""
+    if not names_products(stage):
+        return ()
+    try:
+        products, findings = read_render_products(stage, frame)
+    except StageError as problem:
+        return (EditFinding("", "", str(problem), Severity.ERROR),)
+    found = list(findings)
+    for product in products:
+        try:
+            found += product_output(product)[1]
+        except ImageError as problem:
+            found.append(EditFinding(product.path, "orderedVars", str(problem), Severity.ERROR))
+        folder = Path(product.file).parent
+        if "#" not in str(folder) and not folder.is_dir():
+            message = f"the folder {folder} does not exist; make it before rendering, or name another"
+            found.append(Finding(product.path, "productName", message))
+    return tuple(found)
 
 
 def _data_type(variable: RenderVariable, source: str) -> list[Finding]:

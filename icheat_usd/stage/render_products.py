@@ -89,6 +89,12 @@ def read_render_products(
     return tuple(products), report.findings()
 
 
+def names_products(stage: Usd.Stage) -> bool:
+    """Whether the stage's render settings list products."""
+    settings = UsdRender.Settings.GetStageRenderSettings(stage)
+    return bool(settings and settings.GetProductsRel().GetForwardedTargets())
+
+
 def _product_path(stage: Usd.Stage, text: str) -> Sdf.Path:
     if Sdf.Path.IsValidPathString(text) and UsdRender.Product(stage.GetPrimAtPath(Sdf.Path(text))):
         return Sdf.Path(text)

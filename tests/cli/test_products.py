@@ -69,6 +69,25 @@ def one_error(capsys: pytest.CaptureFixture[str]) -> str:
     return error
 
 
+def test_check_tells_what_would_keep_products_from_being_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = product("Good", "good.exr", "Beauty")
+    stage = stage_with(tmp_path, good, listed="Good")
+    capsys.readouterr()
+    assert main(["check", "--json", str(stage)]) == 0
+    assert json.loads(capsys.readouterr().out)["findings"] == []
+    bad = product("Wrong", "nowhere/wrong.exr", "Bad", "Gone")
+    stage = stage_with(tmp_path, bad, listed="Wrong")
+    capsys.readouterr()
+    assert main(["check", "--json", str(stage)]) == 1
+    found = {(one["prim"], one["feature"]): one for one in json.loads(capsys.readouterr().out)["findings"]}
+    assert "no RenderVar" in found["/Render/Gone", "orderedVars"]["message"]
+    layer = found["/Render/Wrong", "orderedVars"]
+    assert layer["severity"] == "error" and "/Render/Bad: there is no layer 'specular'" in layer["message"]
+    assert f"{tmp_path / 'nowhere'} does not exist" in found["/Render/Wrong", "productName"]["message"]
+
+
 def test_every_product_is_written_beside_the_stage_with_its_variables(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
