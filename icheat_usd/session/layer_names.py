@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -144,7 +145,9 @@ def canonical(source: str, kind: str = "raw", where: str = "") -> str:
     names = ", ".join((*LAYERS, *(f"{member}.NAME" for member in MEMBERS.values())))
     aliases = ", ".join(f"{alias} = {name}" for alias, name in ALIASES.items())
     what = f"'{source}'" if kind == "raw" else f"{kind} '{source}'"
-    raise ImageError(f"{place}there is no layer {what}; there are {names} ({aliases})")
+    close = difflib.get_close_matches(text, [*LAYERS, *FAMILIES, *ALIASES], n=1)
+    meant = f" (did you mean {close[0]}?)" if close else ""
+    raise ImageError(f"{place}there is no layer {what}{meant}; there are {names} ({aliases})")
 
 
 def channel_name(text: str) -> str:

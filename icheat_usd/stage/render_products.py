@@ -99,7 +99,7 @@ def _product_path(stage: Usd.Stage, text: str) -> Sdf.Path:
     if Sdf.Path.IsValidPathString(text) and UsdRender.Product(stage.GetPrimAtPath(Sdf.Path(text))):
         return Sdf.Path(text)
     known = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Product)]
-    there = f"there are {', '.join(known)}" if known else "the stage has none"
+    there = f"there are {', '.join(known)}" if known else "the stage has none, so add one or give -o FILE alone"
     raise StageError(f"{stage.GetRootLayer().identifier}: no RenderProduct {text}; {there}.")
 
 
