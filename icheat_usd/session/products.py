@@ -10,7 +10,6 @@ from icheat_usd.scene import Finding
 from icheat_usd.session import layer_names
 from icheat_usd.session.rendering import Output
 from icheat_usd.stage.render_products import RenderProduct, RenderVariable, names_products, read_render_products
-from icheat_usd.stage.stacks import EditFinding, Severity
 
 
 def product_output(product: RenderProduct) -> tuple[Output, tuple[Finding, ...]]:
@@ -63,13 +62,13 @@ def product_findings(stage: Any, frame: float | None = None) -> tuple[Finding, .
     try:
         products, findings = read_render_products(stage, frame)
     except StageError as problem:
-        return (EditFinding("", "", str(problem), Severity.ERROR),)
+        return (Finding("", "", str(problem)),)
     found = list(findings)
     for product in products:
         try:
             found += product_output(product)[1]
         except ImageError as problem:
-            found.append(EditFinding(product.path, "orderedVars", str(problem), Severity.ERROR))
+            found.append(Finding(product.path, "orderedVars", str(problem)))
         folder = Path(product.file).parent
         if "#" not in str(folder) and not folder.is_dir():
             message = f"the folder {folder} does not exist; make it before rendering, or name another"

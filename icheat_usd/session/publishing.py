@@ -15,6 +15,7 @@ from icheat_usd.scene import Finding
 from icheat_usd.session import housekeeping, inspection
 from icheat_usd.session.origin import history_entry
 from icheat_usd.stage.pinned import PinnedKey, pinned_keys
+from icheat_usd.stage.schema import FILE_PATH, PAYLOAD
 from icheat_usd.stage.sidecar_uses import repoint_layer
 from icheat_usd.stage.stacks import EditFinding, Severity
 
@@ -59,7 +60,11 @@ def publish(stage: Any, out: str | None = None, *, layers: Sequence[str] = (), w
         The stage has no payload, or the file or a layer cannot be written.
     """
     keys, findings = pinned_keys(stage)
-    findings = [*findings, *_damage(stage, keys), *_errors(stage, keys)]
+    damage = _damage(stage, keys)
+    damaged = {finding.prim for finding in damage}
+    # What is wrong with a payload that cannot be read has been said.
+    others = [f for f in _errors(stage, keys) if f.prim not in damaged or f.feature not in (PAYLOAD, FILE_PATH)]
+    findings = [*findings, *damage, *others]
     if findings:
         return Published("", "", keys, (), {}, tuple(dict.fromkeys(findings)))
     root = stage.GetRootLayer().realPath
