@@ -72,7 +72,11 @@ def read_render_choices(stage: Usd.Stage, time: Usd.TimeCode, product: str | Non
 def named_settings_findings(stage: Usd.Stage) -> tuple[Finding, ...]:
     """A finding where the stage names render settings that are none: nothing of them counts."""
     named = stage.GetMetadata("renderSettingsPrimPath")
-    if not named or UsdRender.Settings.GetStageRenderSettings(stage):
+    if not named:
+        return ()
+    if not isinstance(named, str):
+        return (Finding("/", "renderSettingsPrimPath", "is no text; write the path of a RenderSettings in quotes."),)
+    if UsdRender.Settings.GetStageRenderSettings(stage):
         return ()
     prim = stage.GetPrimAtPath(named) if Sdf.Path.IsValidPathString(named) else None
     what = f"is a {prim.GetTypeName() or 'typeless prim'} and no RenderSettings" if prim else "does not exist"

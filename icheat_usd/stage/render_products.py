@@ -11,6 +11,7 @@ from pxr import Sdf, Usd, UsdRender
 
 from icheat_usd.errors import StageError
 from icheat_usd.scene import Finding
+from icheat_usd.stage.camera import named_settings_findings
 from icheat_usd.stage.refusals import named_refusals
 from icheat_usd.stage.reporting import Reporter
 
@@ -90,7 +91,9 @@ def read_render_products(
 
 
 def names_products(stage: Usd.Stage) -> bool:
-    """Whether the stage's render settings list products."""
+    """Whether the stage has render settings and these list products."""
+    if named_settings_findings(stage):
+        return False
     settings = UsdRender.Settings.GetStageRenderSettings(stage)
     return bool(settings and settings.GetProductsRel().GetForwardedTargets())
 

@@ -182,6 +182,10 @@ def test_settings_that_the_stage_names_and_that_are_none_are_found() -> None:
         stage.SetMetadata("renderSettingsPrimPath", named)
         (finding,) = named_settings_findings(stage)
         assert finding.feature == "renderSettingsPrimPath" and f"{named} {problem}" in finding.message
+    typed = Sdf.Layer.CreateAnonymous(".usda")
+    typed.ImportFromString("#usda 1.0\n(\n    renderSettingsPrimPath = </Render/gone>\n)\n")
+    (finding,) = named_settings_findings(Usd.Stage.Open(typed))
+    assert "is no text" in finding.message
     UsdRender.Settings.Define(stage, "/Render/gone")
     stage.SetMetadata("renderSettingsPrimPath", "/Render/gone")
     assert named_settings_findings(stage) == ()
