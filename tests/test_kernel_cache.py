@@ -33,13 +33,23 @@ def twice(x):
 """
 
 
+def make_package(root: Path) -> None:
+    kernels = root / "icheat_usd" / "kernels"
+    kernels.mkdir(parents=True)
+    for package in (kernels.parent, kernels):
+        (package / "__init__.py").touch()
+    shutil.copy(PACKAGE / "_jit.py", kernels)
+    shutil.copy(PACKAGE.parent / "cache_folder.py", kernels.parent)
+    (kernels / "caller.py").write_text(CALLER)
+
+
 def answer_of(root: Path, number: int, factor: int) -> tuple[int, int]:
     """What the kernel says in a process of its own, and how many compiled kernels it found in the cache."""
     (root / "icheat_usd" / "kernels" / "helper.py").write_text(HELPER.format(number=number, factor=factor))
     code = "from icheat_usd.kernels.caller import answer; print(answer(), sum(answer.stats.cache_hits.values()))"
     result = subprocess.run(
         [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": str(root), "ICHEAT_CACHE_DIR": str(root / "cache")},
+        env=os.environ | {"PYTHONPATH": str(root), "ICHEAT_CACHE_DIR": str(root.parent / "cache")},
         cwd=root,
         capture_output=True,
         text=True,
@@ -52,19 +62,19 @@ def answer_of(root: Path, number: int, factor: int) -> tuple[int, int]:
 def test_a_changed_constant_or_helper_in_another_file_is_seen_and_the_same_source_is_not_compiled_again(
     tmp_path: Path,
 ) -> None:
-    kernels = tmp_path / "icheat_usd" / "kernels"
-    kernels.mkdir(parents=True)
-    for package in (kernels.parent, kernels):
-        (package / "__init__.py").touch()
-    shutil.copy(PACKAGE / "_jit.py", kernels)
-    for name in ("cache_folder.py",):
-        shutil.copy(PACKAGE.parent / name, kernels.parent)
-    (kernels / "caller.py").write_text(CALLER)
-    assert answer_of(tmp_path, 10, 2) == (20, 0)
-    assert answer_of(tmp_path, 10, 2) == (20, 1)
-    assert answer_of(tmp_path, 11, 2) == (22, 0)
-    assert answer_of(tmp_path, 11, 3) == (33, 0)
-    assert answer_of(tmp_path, 10, 2) == (20, 1)
+    make_package(tmp_path / "a")
+    assert answer_of(tmp_path / "a", 10, 2) == (20, 0)
+    assert answer_of(tmp_path / "a", 10, 2) == (20, 1)
+    assert answer_of(tmp_path / "a", 11, 2) == (22, 0)
+    assert answer_of(tmp_path / "a", 11, 3) == (33, 0)
+    assert answer_of(tmp_path / "a", 10, 2) == (20, 1)
+
+
+def test_another_installation_of_the_same_sources_finds_what_was_compiled(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        make_package(tmp_path / name)
+    assert answer_of(tmp_path / "a", 10, 2) == (20, 0)
+    assert answer_of(tmp_path / "b", 10, 2) == (20, 1)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,9 @@ to a helper in another file it keeps serving the old machine code. Each kernel
 is therefore cached in a folder named by the contents of its own module and of
 every kernel module that it imports, constants included, and by all that turns
 source into machine code (Python, NumPy, Numba, LLVM, the processor, Numba's
-options), so a stale kernel cannot be found.
+options), so a stale kernel cannot be found. Where the package lies is not in
+the name: Numba would compile everything again for each checkout and each
+virtual environment.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ import llvmlite  # noqa: E402
 import llvmlite.binding  # noqa: E402
 import numba  # noqa: E402
 import numpy as np  # noqa: E402
+from numba.core import caching  # noqa: E402
 
 from icheat_usd.cache_folder import cache_folder  # noqa: E402
 
@@ -104,14 +107,46 @@ def closure_digest(module: str, folder: Path = _KERNELS, facts: str | None = Non
 _digest_of_module = functools.cache(closure_digest)
 
 
+class _FolderOfContents(caching._CacheLocator):  # type: ignore[misc]
+    """Where Numba keeps what it compiles of one kernel."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._digest = _digest_of_module(function.__module__.rpartition(".")[2])
+        self._line = function.__code__.co_firstlineno
+        self._py_file = file  # Numba names it in warnings.
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _FolderOfContents | None:
+        found = cls(py_func, py_file)
+        try:
+            found.ensure_cache_path()
+        except OSError:  # Not to be written to: Numba goes on to its own folders.
+            return None
+        return found
+
+    def get_cache_path(self) -> str:
+        return str(cache_directory() / self._digest)
+
+    def get_source_stamp(self) -> str:
+        return self._digest
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Compiled(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = [_FolderOfContents, *caching.CompileResultCacheImpl._locator_classes]
+
+
+class _Cache(caching.FunctionCache):  # type: ignore[misc]
+    _impl_class = _Compiled
+
+
 def _compile(function: Function, **options: Any) -> Function:
-    module = function.__module__.rpartition(".")[2]
-    previous = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(cache_directory() / _digest_of_module(module))
-    try:
-        return cast(Function, numba.njit(cache=True, nogil=True, **options)(function))
-    finally:
-        numba.config.CACHE_DIR = previous
+    dispatcher = numba.njit(nogil=True, **options)(function)
+    # What `cache=True` does, with a folder of our choice: Numba's own are named by where the source lies.
+    dispatcher._cache = _Cache(function)
+    return cast(Function, dispatcher)
 
 
 def kernel(function: Function) -> Function:
