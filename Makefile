@@ -10,8 +10,9 @@ BIN := $(VENV)/bin
 PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
 	$$name -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& command -v $$name && break; done)
-# In several processes; the tests of a file share what they compute, so they stay together.
-PYTEST_ARGS ?= -q -n auto --maxprocesses 4 --dist loadfile
+# In several processes; the tests of a file share what they compute, so they stay together, and tests/conftest.py says
+# which come first.
+PYTEST_ARGS ?= -q -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-oldest-usd lint clean
 .DEFAULT_GOAL := test

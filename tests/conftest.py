@@ -18,3 +18,12 @@ def shared_scenes() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no folder of outside scenes at {folder}; set ICHEAT_SHARED_SCENES")
     return folder
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests come first: begun last, one of them would keep a core busy while the others have no more.
+
+    By itself, the scheduler of several processes begins with the files of the most tests, which are quick ones.
+    """
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
