@@ -158,6 +158,10 @@ def parallel_kernel(function: Function) -> Function:
     """Compile a kernel whose ``prange`` iterations each own their output.
 
     No sums across iterations: the same bits for any number of threads.
+
+    Numba takes the index for signed at first, and for unsigned when it compiles
+    the loop. Kernels get it as ``np.int64(index)``: otherwise they, and all that
+    they call, are compiled twice.
     """
     return _compile(function, parallel=True)
 

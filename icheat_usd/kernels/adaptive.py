@@ -86,4 +86,4 @@ def edges(instance: np.ndarray, seen: np.ndarray, kind: np.ndarray, width: int, 
     `instance` and `seen` are of one sample of each pixel.
     """
     for y in prange(len(out) // width):
-        _edges_of_row(instance, seen, kind, width, y, limits, out)
+        _edges_of_row(instance, seen, kind, width, np.int64(y), limits, out)

@@ -123,7 +123,7 @@ def list_casters(rays, selected, wanted, local, number, listed):  # type: ignore
     for r in prange(rays.cell.shape[0]):
         number[r] = 0
         if wanted[r]:
-            _list_row(r, rays, selected, local, number, listed)
+            _list_row(np.int64(r), rays, selected, local, number, listed)
 
 
 @kernel

@@ -115,7 +115,7 @@ def dome_columns_cdf(texels: F32, begin: int, width: int, height: int, cdf: F32,
         band = math.cos(math.pi * row / height) - math.cos(math.pi * (row + 1) / height)
         total = 0.0
         for column in range(width):
-            total += _mean_over_texel(texels, begin, width, height, column, row)
+            total += _mean_over_texel(texels, begin, width, height, column, np.int64(row))
             cdf[row * width + column] = total
         if total > 0.0:
             for column in range(width):

@@ -61,7 +61,7 @@ def clamp_to_neighbours(position, reach, old, out):  # type: ignore[no-untyped-d
     out : (n,) float32
     """
     for i in prange(len(reach)):
-        out[i] = _clamped(i, position, reach, old)
+        out[i] = _clamped(np.int64(i), position, reach, old)
 
 
 @kernel
@@ -183,7 +183,7 @@ def find_records(index, position, normal, limit, count, record, weight, coverage
     scale = 2.0**-index.level
     for p in prange(len(position)):
         _find_at(
-            p,
+            np.int64(p),
             index.level,
             scale,
             index.slot,
@@ -245,7 +245,16 @@ def find_covered(index, position, normal, limit, wanted, out):  # type: ignore[n
     scale = 2.0**-index.level
     for p in prange(len(position)):
         out[p] = _is_covered(
-            p, index.level, scale, index.slot, index.record, index.row, position, normal, limit, wanted
+            np.int64(p),
+            index.level,
+            scale,
+            index.slot,
+            index.record,
+            index.row,
+            position,
+            normal,
+            limit,
+            wanted,
         )
 
 

@@ -48,7 +48,7 @@ def find_patches(  # type: ignore[no-untyped-def]
         number[i] = 0
         if finest[i] >= 0:
             number[i] = _patches_of(
-                i,
+                np.int64(i),
                 begin,
                 resolution,
                 first,

@@ -34,7 +34,7 @@ class MaskTable(NamedTuple):
 def any_positive(weights, out):  # type: ignore[no-untyped-def]
     """Whether any of the weights (n, n_rows) of each place is above 0, (n,) uint8, out."""
     for p in prange(len(weights)):
-        out[p] = _any_positive(p, weights)
+        out[p] = _any_positive(np.int64(p), weights)
 
 
 @kernel

@@ -98,7 +98,8 @@ def merge_rays(  # type: ignore[no-untyped-def]
 def keep(end, number, caster, weights, light, kept_caster, kept_weights, kept_light):  # type: ignore[no-untyped-def]
     """Put what `merge_rays` left of each record's rays into rows up to ``end[g]`` of other arrays."""
     for g in prange(len(number)):
-        _keep(g, end[g] - number[g], end[g], caster, weights, light, kept_caster, kept_weights, kept_light)
+        at = np.int64(g)
+        _keep(at, end[g] - number[g], end[g], caster, weights, light, kept_caster, kept_weights, kept_light)
 
 
 @kernel

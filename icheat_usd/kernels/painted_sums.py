@@ -51,7 +51,7 @@ def painted_sums(  # type: ignore[no-untyped-def]
         if begin[r] < begin[r + 1]:
             turn = turn_of(seed, rays.stream[r])
             _sums_of_row(
-                r,
+                np.int64(r),
                 rays,
                 face,
                 face_uv,

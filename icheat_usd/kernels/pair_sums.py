@@ -59,7 +59,21 @@ def pair_sums(  # type: ignore[no-untyped-def]
     """
     for t in prange(len(row)):
         _sums_of_hemisphere(
-            t, hemispheres, pairs, edits, amount, sent, emits, seed, n_theta, n_phi, row, which, is_in, out, beside
+            np.int64(t),
+            hemispheres,
+            pairs,
+            edits,
+            amount,
+            sent,
+            emits,
+            seed,
+            n_theta,
+            n_phi,
+            row,
+            which,
+            is_in,
+            out,
+            beside,
         )
 
 

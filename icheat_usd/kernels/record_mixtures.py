@@ -87,7 +87,7 @@ def mix_records(  # type: ignore[no-untyped-def]
     """
     for q in prange(len(where)):
         _mix_at(
-            q,
+            np.int64(q),
             where[q],
             at,
             facing,

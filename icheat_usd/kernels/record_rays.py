@@ -196,7 +196,7 @@ def trace_hemispheres(  # type: ignore[no-untyped-def]
     """
     for r in prange(len(stream)):
         _trace_hemisphere(
-            r,
+            np.int64(r),
             trace,
             cells,
             locator,

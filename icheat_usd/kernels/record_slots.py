@@ -319,7 +319,7 @@ def _choose(  # type: ignore[no-untyped-def]
 def rows_in(masks, acts, out):  # type: ignore[no-untyped-def]
     """Bits of the rows that act in columns of masks (k, n_rows), into words (k, n_words)."""
     for k in prange(len(masks)):
-        _rows_in(k, masks, acts, out)
+        _rows_in(np.int64(k), masks, acts, out)
 
 
 @kernel
@@ -372,7 +372,7 @@ def mix_slots(  # type: ignore[no-untyped-def]
     """
     for q in prange(len(where)):
         _mix_at(
-            q,
+            np.int64(q),
             where[q],
             frame,
             values,

@@ -39,7 +39,7 @@ def record_sums(  # type: ignore[no-untyped-def]
     """
     for r in prange(len(stream)):
         _sums_of_record(
-            r,
+            np.int64(r),
             radiance,
             distance,
             shading_normal,

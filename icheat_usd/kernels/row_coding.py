@@ -247,7 +247,20 @@ def decode_columns(left, right, left_share, right_share, indptr, indices, number
     columns : (c,) int64, steps : (n_rows, c) float32
     """
     for r in prange(len(pattern)):
-        _decode_columns(r, left, right, left_share, right_share, indptr, indices, numbers, columns, steps, pattern, out)
+        _decode_columns(
+            np.int64(r),
+            left,
+            right,
+            left_share,
+            right_share,
+            indptr,
+            indices,
+            numbers,
+            columns,
+            steps,
+            pattern,
+            out,
+        )
 
 
 @kernel

@@ -62,7 +62,7 @@ def row_sums(  # type: ignore[no-untyped-def]
     """
     for b in prange(len(is_new)):
         _sums_of_base(
-            b,
+            np.int64(b),
             hemispheres,
             stack,
             sent,

@@ -37,7 +37,7 @@ def instance_areas(points, mesh_begin, instance_mesh, to_world, out):  # type: i
         total = 0.0
         mesh = instance_mesh[i]
         for t in range(mesh_begin[mesh], mesh_begin[mesh + 1]):
-            total += _triangle_area(points, to_world, i, t)
+            total += _triangle_area(points, to_world, np.int64(i), t)
         out[i] = total
 
 
