@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from icheat_usd.resources import resource_path
 from icheat_usd.session.document import Session
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.quality import DRAFT, LIVE, PREVIEW, RECORDS, Quality
-from icheat_usd.session.warming import Listed
+from icheat_usd.session.warming import RARE, Listed
 
 _ROOT = Path(__file__).parents[1]
 _WIDTH, _HEIGHT = 64, 48
@@ -25,6 +25,8 @@ _LITTLE: dict[str, Any] = {"n_gather": 1024, "rays_per_row": 16, "rays_per_bounc
 _LIVE = replace(LIVE, **_LITTLE, record_rays=128)
 #: What `icheat relight` does, with `--draft` and with `--exact`.
 _RELIGHT = (replace(RECORDS, **_LITTLE, record_rays=128), replace(DRAFT, **_LITTLE), replace(PREVIEW, **_LITTLE))
+#: Not those that call kernels by themselves, with types that nothing else has.
+_WHOLE_PICTURES = ("tests/final_gather", "tests/relight", "tests/session", "tests/cli", "tests/test_known_answers.py")
 #: A lamp and opaque walls; a sky, glass, metal and painted edits.
 _STAGES = ("cornell_box", "glossy_set")
 
@@ -73,16 +75,27 @@ TASKS: dict[str, Callable[[], None]] = {"live": _live, "relight": _relight, "ren
 def record(purpose: str) -> None:
     """Do what a purpose does, and print the kernels that this process has compiled or loaded, as JSON."""
     TASKS[purpose]()
+    print(json.dumps(_entries(purpose, lambda dispatcher: dispatcher.overloads)))
+
+
+def record_cache() -> None:
+    """Print the kernels that the cache has, as JSON, whichever process put them there."""
+    # Keys of Numba's index begin with the types of the arguments.
+    print(json.dumps(_entries(RARE, lambda kernel: [key[0] for key in kernel._cache._cache_file._load_index()])))
+
+
+def _entries(purpose: str, types_of: Callable[[Any], Iterable[Any]]) -> list[Listed]:
     found = []
     for name, dispatcher in dispatchers():
-        for types in dispatcher.overloads:
+        for types in types_of(dispatcher):
             try:
                 words = [encode(kind) for kind in types]
             except UnlistedTypeError as error:  # it is compiled with its caller
                 print(f"{name} is left out: the list has no word for the type {error}", file=sys.stderr)
                 continue
-            found.append((name, words, [purpose], kernels_called(dispatcher), len(dispatcher.py_func.__code__.co_code)))
-    print(json.dumps(found))
+            size = len(dispatcher.py_func.__code__.co_code)
+            found.append(Listed(name, words, [purpose], kernels_called(dispatcher), size))
+    return found
 
 
 def recorded(purpose: str, cache: str | None = None, keeps: bool = False) -> list[Listed]:
@@ -96,11 +109,39 @@ def recorded(purpose: str, cache: str | None = None, keeps: bool = False) -> lis
     keeps
         Whether what is computed is kept there, too: what is found on disk may be of other types than what is made.
     """
-    environment = os.environ | ({} if cache is None else {"ICHEAT_CACHE_DIR": cache})
-    environment["ICHEAT_CACHE_SIZE"] = "1G" if keeps else "0"
-    command = [sys.executable, "-c", f"from tools.kernel_list import record; record({purpose!r})"]
+    environment = {} if cache is None else {"ICHEAT_CACHE_DIR": cache}
+    return _printed(f"record({purpose!r})", environment | {"ICHEAT_CACHE_SIZE": "1G" if keeps else "0"})
+
+
+def recorded_in_tests(cache: str) -> list[Listed]:
+    """All that a folder for what is compiled has after the tests of whole pictures, which have what few stages have."""
+    environment = {"ICHEAT_CACHE_DIR": cache}
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "auto", "--dist", "loadfile", *_WHOLE_PICTURES]
+    # Whether the list is up to date, which it is about to be.
+    command.append("--ignore=tests/session/test_warming.py")
+    subprocess.run(command, cwd=_ROOT, env=os.environ | environment, check=True)
+    return _printed("record_cache()", environment)
+
+
+def _printed(call: str, environment: dict[str, str]) -> list[Listed]:
+    command = [sys.executable, "-c", f"from tools import kernel_list; kernel_list.{call}"]
+    environment = os.environ | environment
     done = subprocess.run(command, cwd=_ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True)
     return [Listed(*entry) for entry in json.loads(done.stdout.splitlines()[-1])]
+
+
+def rare(entries: Iterable[Listed], others: Iterable[Listed]) -> list[Listed]:
+    """Entries for what few stages have, as far as they are still of kernels as these are, and of no other purpose."""
+    known, kernels = {(entry.kernel, json.dumps(entry.types)) for entry in others}, dict(dispatchers())
+    found = []
+    for entry in entries:
+        kernel = kernels.get(entry.kernel)
+        if RARE not in entry.purposes or (entry.kernel, json.dumps(entry.types)) in known or kernel is None:
+            continue
+        code = kernel.py_func.__code__
+        if len(entry.types) == code.co_argcount:
+            found.append(entry._replace(calls=kernels_called(kernel), size=len(code.co_code)))
+    return found
 
 
 def merged(entries: list[Listed]) -> list[Listed]:

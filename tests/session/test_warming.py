@@ -16,8 +16,8 @@ from icheat_usd.cli import main
 from icheat_usd.errors import IcheatError
 from icheat_usd.kernels._signatures import UnlistedTypeError, decode, dispatchers, encode, kernels_called
 from icheat_usd.session import warming
-from icheat_usd.session.warming import PURPOSES, Listed, compile_ahead, listed
-from tools.kernel_list import TASKS, recorded
+from icheat_usd.session.warming import PURPOSES, RARE, Listed, compile_ahead, listed
+from tools.kernel_list import TASKS, rare, recorded
 
 
 class Pair(NamedTuple):
@@ -60,7 +60,7 @@ def test_the_list_is_of_kernels_as_they_are() -> None:
         code = kernels[entry.kernel].py_func.__code__
         assert len(entry.types) == code.co_argcount, f"{entry.kernel} has other arguments; run tools/list_kernels"
         assert entry.calls == kernels_called(kernels[entry.kernel]), f"{entry.kernel}: run tools/list_kernels"
-        assert set(entry.purposes) <= set(PURPOSES)
+        assert set(entry.purposes) <= set(PURPOSES) or entry.purposes == [RARE]
 
 
 @pytest.mark.parametrize("purpose", PURPOSES)
@@ -69,6 +69,21 @@ def test_what_is_called_is_listed(purpose: str) -> None:
     found = [entry for entry in recorded(purpose) if (entry.kernel, json.dumps(entry.types)) not in known]
     assert not found, f"not in the list for '{purpose}', run tools/list_kernels: {[entry.kernel for entry in found]}"
     assert set(TASKS) == set(PURPOSES)
+
+
+def test_what_few_stages_need_stays_listed_while_it_is_of_kernels_as_they_are() -> None:
+    mine = [one for one in listed() if one.purposes == [RARE]]
+    assert [one.kernel for one in rare(mine, [])] == [one.kernel for one in mine] and len(mine) > 100
+    first, second = rare(mine[:2], [])
+    changed = [
+        first,
+        second,  # called by something else now
+        first._replace(kernel="random.gone"),
+        first._replace(types=[*first.types, "int64"]),
+        second._replace(purposes=["live"]),
+    ]
+    assert rare(changed, [second._replace(purposes=["render"])]) == [first]
+    assert rare([first._replace(calls=["random.gone"], size=1)], []) == [first]
 
 
 def entry(kernel: str, *calls: str, purposes: tuple[str, ...] = ("live",), size: int = 1) -> Listed:
