@@ -129,6 +129,11 @@ def render(*edits: Edit, threads: int = 2, method: str = "brute") -> FinalGather
         numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
 
 
+@functools.cache
+def unedited(method: str) -> FinalGather:
+    return render(method=method)
+
+
 def touched_pixels(edit: Edit) -> np.ndarray:
     """(h, w) bool: a camera sample of the pixel, of those that `render` takes, has a receiver mask above 0."""
     pipeline = previews()[0]
@@ -141,7 +146,7 @@ def touched_pixels(edit: Edit) -> np.ndarray:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("edit", [BLEED, TURN, painted("scale", {"gain": 4.0})], ids=["scale", "hsv", "soft"])
 def test_pixels_outside_the_receivers_keep_their_bits(edit, method):
-    plain, edited = render(method=method), render(edit, method=method)
+    plain, edited = unedited(method), render(edit, method=method)
     for layer in ("direct", "indirect", "emission", "background", "albedo"):
         np.testing.assert_array_equal(getattr(edited, layer), getattr(plain, layer))
     inside = touched_pixels(edit)
@@ -154,7 +159,7 @@ def test_pixels_outside_the_receivers_keep_their_bits(edit, method):
 @pytest.mark.parametrize("method", METHODS)
 def test_an_edit_that_changes_a_fifth_of_the_picture_by_a_twentieth_stays_inside_its_receivers(method):
     strong = Edit("/strong", "scale", {"gain": 2.0}, WHITE, EVERYTHING)
-    plain, edited = render(method=method), render(strong, method=method)
+    plain, edited = unedited(method), render(strong, method=method)
     before = plain.direct + plain.emission + plain.indirect
     after = edited.direct + edited.emission + edited.indirect_edited
     relative = np.abs(after - before).max(axis=-1) / np.maximum(before.max(axis=-1), 1e-6)
@@ -167,7 +172,7 @@ def test_an_edit_that_changes_a_fifth_of_the_picture_by_a_twentieth_stays_inside
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("threads", [1, 2])
 def test_no_edit_muted_edit_and_amount_zero_are_the_unedited_image_bit_for_bit(threads, method):
-    plain = render(method=method)
+    plain = unedited(method)
     np.testing.assert_array_equal(plain.indirect_edited, plain.indirect)
     for edit in (
         Edit("/e", "scale", {"gain": 3.0}, WHITE, EVERYTHING, enabled=False),

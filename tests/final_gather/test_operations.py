@@ -109,9 +109,14 @@ def shiny_render(*edits: Edit, threads: int = 2):
         numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
 
 
+@functools.cache
+def shiny_unedited():
+    return shiny_render()
+
+
 @pytest.mark.parametrize("operation", PARAMETERS)
 def test_the_unedited_image_does_not_depend_on_operations(operation):
-    plain = shiny_render()
+    plain = shiny_unedited()
     found = shiny_render(edit(operation, select("/floor"), lights=("/warm",)))
     for layer in ("direct", "indirect", "emission", "background"):
         np.testing.assert_array_equal(getattr(found, layer), getattr(plain, layer))
