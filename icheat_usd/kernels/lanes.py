@@ -57,6 +57,14 @@ def store_short(builder: Any, values: Any) -> None:
     builder.store(short, builder.inttoptr(values[0], half.as_pointer()), align=8)
 
 
+@_operation(floats, types.int64)
+def load_short(builder: Any, values: Any) -> Any:
+    """16 bfloat16 from an address."""
+    wide, half = ir.VectorType(_I32, 16), ir.VectorType(_I16, 16)
+    short = builder.load(builder.inttoptr(values[0], half.as_pointer()), align=2)
+    return builder.bitcast(builder.shl(builder.zext(short, wide), ir.Constant(wide, [16] * 16)), _LANES)
+
+
 @_operation(floats, types.int64, types.int64, types.int64, floats)
 def add_short_fours(builder: Any, values: Any) -> Any:
     """Add four weighted colours, each in four lanes of its own.

@@ -8,8 +8,18 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.lanes import add_short, add_short_fours, store_short, sum_of_fours
-from icheat_usd.kernels.simd import address_of, color_of, fetch, plus, store_color, zeros
+from icheat_usd.kernels.lanes import add_short, add_short_fours, load_short, store_short, sum_of_fours
+from icheat_usd.kernels.simd import (
+    address_of,
+    color_of,
+    fetch,
+    multiply_add,
+    plus,
+    spread,
+    store,
+    store_color,
+    zeros,
+)
 
 _LEAST = 8  # cells of a part of a cluster
 LANES = 64  # rows of a block of a dense matrix
@@ -234,16 +244,27 @@ def add_missing(
 def reach_clusters(blocks: np.ndarray, leaves: np.ndarray, out: np.ndarray) -> None:
     """Products of dense matrices, one per colour.
 
-    `blocks` (n_blocks, 3, n, LANES) float32 hold LANES rows each, transposed; `leaves` (3, n) and `out` (n, 3) float32.
+    `blocks` (n_blocks, 3, n, LANES) uint16 hold LANES rows each, transposed, as bfloat16: half as much to be read.
+    `leaves` (3, n) and `out` (n, 3) are float32.
     """
     n = leaves.shape[1]
     for task in prange(len(blocks) * 3):
         block, channel = task // 3, task % 3
-        sums = np.zeros(LANES, np.float32)
+        place = address_of(blocks) + task * (n * LANES * 2)
+        s0, s1, s2, s3 = zeros(), zeros(), zeros(), zeros()
         for j in range(n):
-            value = leaves[channel, j]
-            for k in range(LANES):
-                sums[k] += blocks[block, channel, j, k] * value
+            value = spread(leaves[channel, j])
+            s0 = multiply_add(load_short(place), value, s0)
+            s1 = multiply_add(load_short(place + 32), value, s1)
+            s2 = multiply_add(load_short(place + 64), value, s2)
+            s3 = multiply_add(load_short(place + 96), value, s3)
+            place += LANES * 2
+        sums = np.empty(LANES, np.float32)
+        target = address_of(sums)
+        store(target, s0)
+        store(target + 64, s1)
+        store(target + 128, s2)
+        store(target + 192, s3)
         for k in range(min(LANES, n - block * LANES)):
             out[block * LANES + k, channel] = sums[k]
 

@@ -94,6 +94,13 @@ def _find_rest(pieces, now, before, factors, rest, sizes):  # type: ignore[no-un
         _take_proportional(now[some], before[some], factors[pieces[p, 0]], rest[some], sizes[p])
 
 
+def in_lanes(colors):  # type: ignore[no-untyped-def]
+    """Each of some colours (n, 3) and a pad of 0, 16 times: (n, 64) float32."""
+    lanes = np.zeros((len(colors), 16, 4), np.float32)
+    lanes[:, :, :3] = colors[:, None]
+    return lanes.reshape(len(colors), 64)
+
+
 def proportions(pieces, now, before, factors, rest, size):  # type: ignore[no-untyped-def]
     """The factors, channel by channel, that bring earlier values nearest to what they are now, and what is left.
 
@@ -116,7 +123,7 @@ def proportions(pieces, now, before, factors, rest, size):  # type: ignore[no-un
     both, squared = total[:, :3], total[:, 3:]
     found = np.divide(both, squared, out=np.zeros_like(both), where=squared > 0)
     some = np.unique(pieces[:, 0])
-    factors[some] = np.tile(np.pad(found[some], ((0, 0), (0, 1))), (1, 16))
+    factors[some] = in_lanes(found[some])
     sizes = np.empty((len(pieces), 2), np.float32)
     _find_rest(pieces, now, before, factors, rest, sizes)
     np.maximum.at(size, pieces[:, 0], sizes)

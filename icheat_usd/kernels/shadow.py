@@ -14,137 +14,51 @@ before, the others keep what they know, and where one does not, all of the run a
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.embree import call_packet
-from icheat_usd.kernels.lanes import minus, ratio, root, store_whole, where_above
+from icheat_usd.kernels.lanes import minus, where_above
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
-from icheat_usd.kernels.simd import address_of, load, multiply_add, plus, product, spread, store, zeros
+from icheat_usd.kernels.shadow_lanes import CANDIDATE, RUN, look, shine
+from icheat_usd.kernels.simd import address_of, load, multiply_add, plus, product, spread, store
 
-RUN = 64  #: successive places that share shadow rays if that is allowed
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
 PLACE, TINT, GLOSS = 9, 3, 12  #: columns of the tables of places
-POINT = 7  #: columns of the table of points that are looked at for every place
-_RUNS = 16  # of a task
 PART = 4  #: one of so many places of a run sends a ray where that is enough
+STATES = 4  #: a place knows STATES * point + state
+_RUNS = 16  # of a task, whose rays fill packets together
 _INVALID = np.uint32(0xFFFFFFFF)
 _STOP_SHORT = np.float32(1.0 - 1e-4)  # as for other shadow rays: lights may lie in the plane of a ceiling
 _BLOCKED, _CLEAR, _THROUGH = 0, 1, 2
-STATES = 4  #: a place knows STATES * point + state
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-
-# Rows of a task's scratch memory, RUN floats each: direction to the chosen point (for distant lights) or way to it,
-# light, number of the chosen candidate, factors of the specular lobe, random numbers; then what is known of each
-# candidate of 16 places, a packet of rays and its flags.
-_TO_X, _TO_Y, _TO_Z, _LEVEL, _CHOICE, _BASE, _EDGE, _NUMBERS = 0, 1, 2, 3, 4, 5, 6, 7
-_CANDIDATES, _RAYS, _ROWS = 8, 12, 16
+_FOUND = 4  # rows of what a run finds: direction to the chosen point (for distant lights) or way to it, and light
+# How far sums of products of float32 numbers may be from what they are: what is called turned away by more is so.
+_ROUNDED = np.float32(1e-5)
 
 
 @kernel
-def _look(
-    points: int, width: int, candidates: int, distant: bool, place: int, lane: int, numbers: int, scratch: int
-) -> None:
-    """What 16 places of a run, from number `lane`, get from their candidates, and which they would send a ray to.
+def is_turned_away(bounds: np.ndarray, light: np.ndarray, distant: bool) -> bool:
+    """Whether no place of a run can get anything from a light, as one of the two is behind the other.
 
-    Addresses: `points` of the columns of the first place's candidates, each `width` floats long; `place` of the run's
-    columns; `numbers` of a random number of each place; `scratch`.
+    `bounds` (4, 3) of the places and of their geometric normals, least and largest; `light` (4, 3) the same of its
+    points (of directions to it) and of their normals. The scalar product of a way and a normal lies between the sums
+    of the least and of the largest products of their bounds.
     """
-    step, at, out = width * 4, place + lane * 4, scratch + lane * 4
-    x, y, z = load(at), load(at + RUN * 4), load(at + RUN * 8)
-    gx, gy, gz = load(at + RUN * 12), load(at + RUN * 16), load(at + RUN * 20)
-    nx, ny, nz = load(at + RUN * 24), load(at + RUN * 28), load(at + RUN * 32)
-    none, total = zeros(), zeros()
-    for c in range(candidates):
-        point, kept = points + (c * POINT * width + lane) * 4, scratch + _CANDIDATES * RUN * 4 + c * 256
-        dx, dy, dz, power = load(point), load(point + step), load(point + 2 * step), load(point + 6 * step)
-        if distant:
-            here = multiply_add(dx, nx, multiply_add(dy, ny, product(dz, nz)))
-            weight = product(here, power)
-        else:
-            dx, dy, dz = minus(dx, x), minus(dy, y), minus(dz, z)
-            here = multiply_add(dx, nx, multiply_add(dy, ny, product(dz, nz)))
-            away = multiply_add(
-                dx,
-                load(point + 3 * step),
-                multiply_add(dy, load(point + 4 * step), product(dz, load(point + 5 * step))),
-            )
-            square = multiply_add(dx, dx, multiply_add(dy, dy, product(dz, dz)))
-            weight = product(ratio(product(here, minus(none, away)), product(square, square)), power)
-            weight = where_above(none, away, weight, none)
-        above = multiply_add(dx, gx, multiply_add(dy, gy, product(dz, gz)))
-        weight = where_above(here, none, where_above(above, none, weight, none), none)
-        store(kept, dx)
-        store(kept + 64, dy)
-        store(kept + 128, dz)
-        store(kept + 192, weight)
-        total = plus(total, weight)
-    # the last one whose share of the total begins at or below the random number
-    wanted, begin = product(load(numbers + lane * 4), total), zeros()
-    dx, dy, dz, choice = zeros(), zeros(), zeros(), spread(np.float32(-1.0))
-    for c in range(candidates):
-        kept = scratch + _CANDIDATES * RUN * 4 + c * 256
-        weight = load(kept + 192)
-        dx = _if_reached(weight, begin, wanted, load(kept), dx)
-        dy = _if_reached(weight, begin, wanted, load(kept + 64), dy)
-        dz = _if_reached(weight, begin, wanted, load(kept + 128), dz)
-        choice = _if_reached(weight, begin, wanted, spread(np.float32(c)), choice)
-        begin = plus(begin, weight)
-    store(out + _TO_X * RUN * 4, dx)
-    store(out + _TO_Y * RUN * 4, dy)
-    store(out + _TO_Z * RUN * 4, dz)
-    store(out + _LEVEL * RUN * 4, product(total, spread(_ONE / np.float32(candidates))))
-    store_whole(out + _CHOICE * RUN * 4, choice)
-
-
-@kernel
-def _if_reached(weight: Any, begin: Any, wanted: Any, new: Any, old: Any) -> Any:
-    """Where a candidate brings something and its share begins at or below what is wanted the new, else the old."""
-    return where_above(weight, zeros(), where_above(begin, wanted, old, new), old)
-
-
-@kernel
-def _shine(gloss: int, place: int, lane: int, scratch: int) -> None:
-    """Factors of `specular` and `specular_edge` of 16 places of a run: the GGX lobe of `kernels.bsdf.specular_terms`.
-
-    Addresses as those of `_look`; `gloss` of the run's columns.
-    """
-    lobe, at, out = gloss + lane * 4, place + lane * 4, scratch + lane * 4
-    nx, ny, nz = load(at + RUN * 24), load(at + RUN * 28), load(at + RUN * 32)
-    lx, ly, lz = load(out + _TO_X * RUN * 4), load(out + _TO_Y * RUN * 4), load(out + _TO_Z * RUN * 4)
-    none, one = zeros(), spread(_ONE)
-    inverse = ratio(one, root(multiply_add(lx, lx, multiply_add(ly, ly, product(lz, lz)))))
-    lx, ly, lz = product(lx, inverse), product(ly, inverse), product(lz, inverse)
-    light = multiply_add(nx, lx, multiply_add(ny, ly, product(nz, lz)))
-    hx, hy, hz = plus(lx, load(lobe + RUN * 36)), plus(ly, load(lobe + RUN * 40)), plus(lz, load(lobe + RUN * 44))
-    inverse = ratio(one, root(multiply_add(hx, hx, multiply_add(hy, hy, product(hz, hz)))))
-    hx, hy, hz = product(hx, inverse), product(hy, inverse), product(hz, inverse)
-    cosine = multiply_add(nx, hx, multiply_add(ny, hy, product(nz, hz)))
-    # the sine from the cross product, as of a narrow lobe 1 - cos^2 has no digits
-    sx, sy = minus(product(ny, hz), product(nz, hy)), minus(product(nz, hx), product(nx, hz))
-    sz = minus(product(nx, hy), product(ny, hx))
-    alpha = load(lobe + RUN * 24)
-    alpha2 = product(alpha, alpha)
-    sine2 = multiply_add(sx, sx, multiply_add(sy, sy, product(sz, sz)))
-    width = multiply_add(alpha2, product(cosine, cosine), sine2)
-    c2 = product(light, light)
-    c2 = where_above(c2, one, one, c2)
-    smith = root(multiply_add(alpha2, ratio(minus(one, c2), c2), one))
-    smith = product(spread(np.float32(0.5)), minus(smith, one))
-    below = product(plus(plus(one, load(lobe + RUN * 32)), smith), product(load(lobe + RUN * 28), light))
-    below = product(below, product(product(width, width), spread(np.float32(4.0 * math.pi))))
-    value = ratio(alpha2, below)
-    value = where_above(light, none, where_above(cosine, none, where_above(alpha, none, value, none), none), none)
-    met = multiply_add(lx, hx, multiply_add(ly, hy, product(lz, hz)))
-    grazing = minus(one, where_above(met, none, where_above(met, one, one, met), none))
-    square = product(grazing, grazing)
-    edge = product(value, product(product(square, square), grazing))
-    store(out + _BASE * RUN * 4, minus(value, edge))
-    store(out + _EDGE * RUN * 4, edge)
+    most, least, size = _ZERO, _ZERO, _ZERO
+    for c in range(3):
+        low, high = light[0, c], light[1, c]
+        if not distant:
+            low, high = low - bounds[1, c], high - bounds[0, c]
+            a, b = low * light[2, c], low * light[3, c]
+            p, q = high * light[2, c], high * light[3, c]
+            least += min(min(a, b), min(p, q))
+        a, b = low * bounds[2, c], low * bounds[3, c]
+        p, q = high * bounds[2, c], high * bounds[3, c]
+        most += max(max(a, b), max(p, q))
+        size += max(abs(low), abs(high))
+    return most < -_ROUNDED * size or least > _ROUNDED * size
 
 
 @kernel
@@ -161,21 +75,19 @@ def _prepare_packet(rays: np.ndarray) -> None:
 
 @kernel
 def _trace(
-    function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, run: int,
-    scratch: np.ndarray, rows: np.ndarray, n: int, state: np.ndarray,
+    function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, runs: np.ndarray,
+    found: np.ndarray, rays: np.ndarray, valid: np.ndarray, rows: np.ndarray, n: int, state: np.ndarray,
 ) -> None:  # fmt: skip
-    """Shadow rays of `n` places of a run, in packets of 16; their `state` is set."""
-    rays = scratch[_RAYS : _RAYS + 3].reshape(12, 16)
-    valid = scratch[_RAYS + 3, :16].view(np.int32)
+    """Shadow rays of the first `n` rows of some runs, in packets of 16; their `state` is set."""
     limit = np.float32(np.inf) if distant else _STOP_SHORT
     for begin in range(0, n, 16):
         count = min(16, n - begin)
         for lane in range(16):
             valid[lane] = -1 if lane < count else 0
-            j = rows[begin + min(lane, count - 1)]
+            k, j = divmod(np.uint32(rows[begin + min(lane, count - 1)]), np.uint32(RUN))
             for c in range(3):
-                rays[c, lane] = place[run, c, j]
-                rays[4 + c, lane] = scratch[_TO_X + c, j]
+                rays[c, lane] = place[runs[k], c, j]
+                rays[4 + c, lane] = found[k, c, j]
             rays[8, lane] = limit
         call_packet(function, address_of(valid), opaque, address_of(rays), arguments)
         for lane in range(count):
@@ -191,148 +103,203 @@ def _trace(
 
 
 @kernel
-def _meet(
-    function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, run: int,
-    scratch: np.ndarray, points: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, rows: np.ndarray,
-    state: np.ndarray, asks: np.ndarray,
-) -> None:  # fmt: skip
-    """Find what is between the places of a run and their points; `points` (RUN,), -1 where there is none."""
-    follows = phase >= 0
-    # Loops without branches, which the compiler turns into vectors, and one that only counts.
-    if follows:
+def _ask(
+    chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, state: np.ndarray, asks: np.ndarray
+) -> None:
+    """Which places of a run send a ray at first, and what the others know; `chosen` is -1 where there is no point."""
+    # Loops without branches, which the compiler turns into vectors.
+    if phase >= 0:
         for j in range(len(known)):
-            same = known[j] >> 2 == points[j]
-            state[j] = known[j] & 3 if same and points[j] >= 0 else _BLOCKED
-            asks[j] = 1 if points[j] >= 0 and (not same or (j & (PART - 1)) == phase) else 0
+            same = known[j] >> 2 == chosen[j]
+            state[j] = known[j] & 3 if same and chosen[j] >= 0 else _BLOCKED
+            asks[j] = 1 if chosen[j] >= 0 and (not same or (j & (PART - 1)) == phase) else 0
         for j in range(len(known), RUN):
             state[j], asks[j] = _BLOCKED, 0
     else:
         for j in range(RUN):
             state[j] = _BLOCKED
-            asks[j] = 1 if points[j] >= 0 and (not share_rays or (j & (PART - 1)) == 0) else 0
-    count = _rows_that_ask(asks, rows)
-    _trace(function, arguments, opaque, passing, distant, place, run, scratch, rows, count, state)
-    alike = True
-    if follows:
-        for q in range(count):
-            j = rows[q]
-            alike &= known[j] >> 2 != points[j] or known[j] & 3 == state[j]
-    elif share_rays:
-        common = state[rows[0]] if count >= RUN // 8 else _THROUGH
-        for q in range(count):
-            common = common if state[rows[q]] == common else _THROUGH
-        alike = common != _THROUGH
-        for j in range(RUN):
-            if points[j] >= 0 and (j & (PART - 1)) != 0:
-                state[j] = common
-    if alike:
-        return
-    for j in range(RUN):
-        asks[j] = 1 if points[j] >= 0 and asks[j] == 0 else 0
-    count = _rows_that_ask(asks, rows)
-    _trace(function, arguments, opaque, passing, distant, place, run, scratch, rows, count, state)
+            asks[j] = 1 if chosen[j] >= 0 and (not share_rays or (j & (PART - 1)) == 0) else 0
 
 
 @kernel
-def _rows_that_ask(asks: np.ndarray, rows: np.ndarray) -> int:
-    """Numbers of the places with a 1, into `rows`; how many there are."""
-    count = np.int64(0)
+def _agree(
+    rows: np.ndarray, offset: int, chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
+    state: np.ndarray,
+) -> bool:  # fmt: skip
+    """Whether the rays of a run, those of `rows` less `offset`, allow that its other places send none."""
+    if phase >= 0:
+        alike = True
+        for q in range(len(rows)):
+            j = rows[q] - offset
+            alike &= known[j] >> 2 != chosen[j] or known[j] & 3 == state[j]
+        return alike
+    if not share_rays:
+        return True
+    common = state[rows[0] - offset] if len(rows) >= RUN // 8 else _THROUGH
+    for q in range(len(rows)):
+        common = common if state[rows[q] - offset] == common else _THROUGH
     for j in range(RUN):
-        rows[count] = j
+        if chosen[j] >= 0 and (j & (PART - 1)) != 0:
+            state[j] = common
+    return bool(common != _THROUGH)
+
+
+@kernel
+def _append_rows(asks: np.ndarray, offset: int, count: int, rows: np.ndarray) -> int:
+    """Numbers of a run's places with a 1, counted from `offset`, behind the first `count` rows; how many there are."""
+    for j in range(RUN):
+        rows[count] = offset + j
         count += asks[j]
     return count
 
 
 @kernel
-def _light_run(
-    function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
-    colors: np.ndarray, distant: bool, offset: int, shift: float, place: np.ndarray, tint: np.ndarray,
-    gloss: np.ndarray, lobe: int, share_rays: bool, phase: int, known: np.ndarray, row: np.ndarray, out: np.ndarray,
-    through: np.ndarray, run: int, scratch: np.ndarray, whole: np.ndarray,
-    rows: np.ndarray,
+def _meet(
+    function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, runs: np.ndarray,
+    found: np.ndarray, rays: np.ndarray, valid: np.ndarray, chosen: np.ndarray, share_rays: bool, phase: int,
+    known: np.ndarray, state: np.ndarray,
 ) -> None:  # fmt: skip
-    """`light_places` for one run; `whole` (3, RUN) int32 and `rows` (RUN,) int64 are scratch memory as well."""
-    candidates, width = points.shape[0], points.shape[2]
-    start, here, size = address_of(scratch), address_of(place) + run * (PLACE * RUN * 4), min(RUN, len(row) - run * RUN)
-    for lane in range(0, RUN, 16):
-        numbers = load(start + _NUMBERS * RUN * 4 + lane * 4)
-        numbers = plus(numbers, spread(np.float32(shift)))
-        below_one = spread(np.float32(1.0 - 2.0**-24))
-        numbers = where_above(numbers, below_one, minus(numbers, spread(_ONE)), numbers)
-        store(start + _LEVEL * RUN * 4 + lane * 4, numbers)
-        _look(address_of(points) + offset * 4, width, candidates, distant, here, lane, start + _LEVEL * RUN * 4, start)
-    chosen, state, asks = whole[0], whole[1], whole[2]
-    choice, first = scratch[_CHOICE].view(np.int32), first_point[offset : offset + RUN]
-    for j in range(RUN):
-        chosen[j] = first[j] + choice[j] if choice[j] >= 0 else -1
-    chosen[size:] = -1
-    _meet(
-        function, arguments, opaque, passing, distant, place, run, scratch, chosen, share_rays, phase,
-        known[run * RUN : run * RUN + size], rows, state, asks,
-    )  # fmt: skip
-    levels, n_lit = scratch[_LEVEL], np.int32(0)
+    """Find what is between the places of some runs and their points, `chosen` (n_runs, RUN)."""
+    n = len(runs)
+    asks, begin = np.empty((n, RUN), np.int32), np.zeros(n + 1, np.int64)
+    rows, others = np.empty(n * RUN + 1, np.int32), np.empty(n * RUN + 1, np.int32)
+    every_state = state.reshape(-1)
+    for k in range(n):
+        _ask(chosen[k], share_rays, phase, known[runs[k] * RUN : (runs[k] + 1) * RUN], state[k], asks[k])
+        begin[k + 1] = _append_rows(asks[k], k * RUN, begin[k], rows)
+    _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, rows, begin[n], every_state)
+    count = 0
+    for k in range(n):
+        offset = k * RUN
+        some = rows[begin[k] : begin[k + 1]]
+        knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
+        if not _agree(some, offset, chosen[k], share_rays, phase, knows, state[k]):
+            for j in range(RUN):
+                asks[k, j] = 1 if chosen[k, j] >= 0 and asks[k, j] == 0 else 0
+            count = _append_rows(asks[k], offset, count, others)
+    _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, others, count, every_state)
+
+
+@kernel
+def _reflect(
+    colors: np.ndarray, here: int, tint: int, gloss: int, found: np.ndarray, chosen: np.ndarray, state: np.ndarray,
+    room: int,
+) -> None:  # fmt: skip
+    """What the places of a run reflect, into the first three rows of `found`.
+
+    Addresses of the run's columns; `gloss` 0: no place has a lobe. `room` has place for 32 floats.
+    """
+    levels, n_lit = found[3], np.int32(0)
     for j in range(RUN):
         levels[j] = levels[j] if state[j] != _BLOCKED else _ZERO
         n_lit += state[j]
-    lit = n_lit > 0
-    if not lit:
-        scratch[_TO_X : _TO_Z + 1] = _ZERO
-    elif lobe >= 0:
-        for lane in range(0, RUN, 16):
-            _shine(address_of(gloss) + lobe * (GLOSS * RUN * 4), here, lane, start)
-    for lane in range(0, RUN if lit else 0, 16):
+    if n_lit == 0:
+        found[:3] = _ZERO
+        return
+    start = address_of(found)
+    for lane in range(0, RUN, 16):
+        if gloss != 0:
+            shine(gloss, here, lane, start, room)
         at = start + lane * 4
-        level = load(at + _LEVEL * RUN * 4)
+        level = load(at + RUN * 12)
         for c in range(3):
-            reflects = load(address_of(tint) + ((run * TINT + c) * RUN + lane) * 4)
-            if lobe >= 0:
-                of_lobe = address_of(gloss) + ((lobe * GLOSS + c) * RUN + lane) * 4
-                reflects = multiply_add(load(of_lobe), load(at + _BASE * RUN * 4), reflects)
-                reflects = multiply_add(load(of_lobe + RUN * 12), load(at + _EDGE * RUN * 4), reflects)
-            store(at + (_TO_X + c) * RUN * 4, product(reflects, level))
+            column = (c * RUN + lane) * 4
+            reflects = load(tint + column)
+            if gloss != 0:
+                reflects = multiply_add(load(gloss + column), load(room), reflects)
+                reflects = multiply_add(load(gloss + column + RUN * 12), load(room + 64), reflects)
+            store(at + c * RUN * 4, product(reflects, level))
     if len(colors) > 0:
-        for j in range(size):
+        for j in range(RUN):
             if chosen[j] >= 0:
                 for c in range(3):
-                    scratch[_TO_X + c, j] *= colors[chosen[j], c]
-    red, green, blue, first_row = scratch[_TO_X], scratch[_TO_Y], scratch[_TO_Z], run * RUN
-    for j in range(size):
-        target = np.uint64(row[first_row + j])
-        out[target, 0], out[target, 1], out[target, 2] = red[j], green[j], blue[j]
+                    found[c, j] *= colors[chosen[j], c]
+
+
+@kernel
+def _get_nothing(run: int, row: np.ndarray, out: np.ndarray, through: np.ndarray, known: np.ndarray) -> None:
+    """What `light_places` says of a run that is turned away from the light."""
+    begin, end = run * RUN, min((run + 1) * RUN, len(row))
+    for i in range(begin, end):
+        target = np.uint64(row[i])
+        out[target, 0], out[target, 1], out[target, 2] = _ZERO, _ZERO, _ZERO
     if len(through) > 0:
-        for j in range(size):
-            through[first_row + j] = 1 + chosen[j] if state[j] == _THROUGH else 0
+        for i in range(begin, end):
+            through[i] = 0
     if len(known) > 0:
-        found = known[first_row : first_row + size]
-        for j in range(size):
-            found[j] = STATES * chosen[j] + state[j] if chosen[j] >= 0 else -1
+        for i in range(begin, end):
+            known[i] = -1
 
 
 @kernel
 def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
-    colors: np.ndarray, distant: bool, seed: int, turn: int, place: np.ndarray, tint: np.ndarray, gloss: np.ndarray,
-    lobes: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, row: np.ndarray, out: np.ndarray,
-    through: np.ndarray, first: int, last: int,
+    colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray, place: np.ndarray,
+    tint: np.ndarray, gloss: np.ndarray, lobes: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
+    row: np.ndarray, out: np.ndarray, through: np.ndarray, first: int, last: int,
 ) -> None:  # fmt: skip
     """`light_places` for the runs from `first` up to `last`."""
-    storage = np.empty((_ROWS + 1) * RUN, np.float32)
-    skip = np.int64((-storage.ctypes.data % 64) // 4)
-    scratch = storage[skip : skip + _ROWS * RUN].reshape(_ROWS, RUN)
-    whole, rows = np.empty((3, RUN), np.int32), np.empty(RUN, np.int64)
-    _prepare_packet(scratch[_RAYS : _RAYS + 3].reshape(12, 16))
+    n, candidates, width = last - first, points.shape[0], points.shape[2]
+    n_found, n_room = n * _FOUND * RUN, max(candidates * CANDIDATE, 32)
+    storage = np.empty(n_found + 13 * 16 + n_room + 16, np.float32)
+    begin = (-address_of(storage) % 64) // 4
+    found = storage[begin : begin + n_found].reshape(n, _FOUND, RUN)
+    begin += n_found
+    rays, valid = storage[begin : begin + 192].reshape(12, 16), storage[begin + 192 : begin + 208].view(np.int32)
+    room = address_of(storage) + (begin + 208) * 4
+    chosen, state = np.empty((n, RUN), np.int32), np.empty((n, RUN), np.int32)
+    runs = np.empty(n, np.int64)
+    numbers = np.empty(RUN, np.float32)
     for j in range(RUN):
         # multiples of the golden ratio are spread evenly, modulo 1, however many of them there are
-        scratch[_NUMBERS, j] = np.float32((j * 0.6180339887498949) % 1.0)
-    of_turn = hash_combine(seed, turn)
-    groups = points.shape[2] - RUN
+        numbers[j] = np.float32((j * 0.6180339887498949) % 1.0)
+    _prepare_packet(rays)
+    of_turn, groups = hash_combine(seed, turn), width - RUN
+    below_one, one = spread(np.float32(1.0 - 2.0**-24)), spread(_ONE)
+    n = 0
     for run in range(first, last):
+        if is_turned_away(bounds[run], light, distant):
+            _get_nothing(run, row, out, through, known)
+            continue
+        k, runs[n] = n, run
+        n += 1
         offset = np.int64(hash_u32(np.uint32(run) ^ np.uint32(seed))) & (groups - 1)
-        shift = to_unit(hash_u32(np.uint32(of_turn) ^ np.uint32(run)))
-        _light_run(
-            function, arguments, opaque, passing, points, first_point, colors, distant, offset, shift, place, tint,
-            gloss, np.int64(lobes[run]), share_rays, phase, known, row, out, through, run, scratch, whole, rows,
-        )  # fmt: skip
+        shift = spread(to_unit(hash_u32(np.uint32(of_turn) ^ np.uint32(run))))
+        here, size = address_of(place) + run * (PLACE * RUN * 4), min(RUN, len(row) - run * RUN)
+        for lane in range(0, RUN, 16):
+            number = plus(load(address_of(numbers) + lane * 4), shift)
+            number = where_above(number, below_one, minus(number, one), number)
+            look(
+                address_of(points) + offset * 4, width, candidates, distant, here, lane, number, room,
+                address_of(found[k]), address_of(chosen[k]),
+            )  # fmt: skip
+        for j in range(RUN):
+            chosen[k, j] = first_point[offset + j] + chosen[k, j] if chosen[k, j] >= 0 else -1
+        chosen[k, size:] = -1
+    _meet(
+        function, arguments, opaque, passing, distant, place, runs[:n], found, rays, valid, chosen, share_rays, phase,
+        known, state,
+    )  # fmt: skip
+    for k in range(n):
+        run = runs[k]
+        lobe = np.int64(lobes[run])
+        of_lobe = address_of(gloss) + lobe * (GLOSS * RUN * 4) if lobe >= 0 else 0
+        here, of_tint = address_of(place) + run * (PLACE * RUN * 4), address_of(tint) + run * (TINT * RUN * 4)
+        _reflect(colors, here, of_tint, of_lobe, found[k], chosen[k], state[k], room)
+        red, green, blue, of_run = found[k, 0], found[k, 1], found[k, 2], run * RUN
+        size = min(RUN, len(row) - of_run)
+        for j in range(size):
+            target = np.uint64(row[of_run + j])
+            out[target, 0], out[target, 1], out[target, 2] = red[j], green[j], blue[j]
+        if len(through) > 0:
+            for j in range(size):
+                through[of_run + j] = 1 + chosen[k, j] if state[k, j] == _THROUGH else 0
+        if len(known) > 0:
+            knows = known[of_run : of_run + size]
+            for j in range(size):
+                knows[j] = STATES * chosen[k, j] + state[k, j] if chosen[k, j] >= 0 else -1
+    storage[0] = _ZERO  # Numba may free an array after its last mention, and addresses do not count.
+    numbers[0] = _ZERO
 
 
 @parallel_kernel
@@ -344,9 +311,11 @@ def light_places(
     points: np.ndarray,
     first_point: np.ndarray,
     colors: np.ndarray,
+    light: np.ndarray,
     distant: bool,
     seed: int,
     turn: int,
+    bounds: np.ndarray,
     place: np.ndarray,
     tint: np.ndarray,
     gloss: np.ndarray,
@@ -374,8 +343,10 @@ def light_places(
         Places of a run look at groups that follow one another.
     first_point : (n_groups + `RUN`,) int32, number of the first point of each group
     colors : (m, 3) float32, colour of each point; none: all are white
+    light : (4, 3) float32, least and largest place of the points, and least and largest normal
     turn : int
         Number of the ray of each place.
+    bounds : (n_runs, 4, 3) float32, least and largest origin of a run, and least and largest geometric normal
     place : (n_runs, `PLACE`, `RUN`) float32
         Origin off the surface, geometric normal, shading normal.
     tint : (n_runs, `TINT`, `RUN`) float32, albedo over pi
@@ -398,8 +369,12 @@ def light_places(
         without them; else 0. None: there are no such surfaces.
     """
     n_runs = len(place)
-    for task in prange((n_runs + _RUNS - 1) // _RUNS):
+    n_tasks = (n_runs + _RUNS - 1) // _RUNS
+    for i in prange(n_tasks):
+        # Threads take turns from first to last: what is lit may be all at one side.
+        task = 2 * i if 2 * i < n_tasks else 2 * (i - (n_tasks + 1) // 2) + 1
         _light_runs(
-            function, arguments, opaque, passing, points, first_point, colors, distant, seed, turn, place, tint, gloss,
-            lobes, share_rays, phase, known, row, out, through, task * _RUNS, min(n_runs, (task + 1) * _RUNS),
+            function, arguments, opaque, passing, points, first_point, colors, light, distant, seed, turn, bounds,
+            place, tint, gloss, lobes, share_rays, phase, known, row, out, through, task * _RUNS,
+            min(n_runs, (task + 1) * _RUNS),
         )  # fmt: skip

@@ -9,7 +9,8 @@ import numpy as np
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers
-from icheat_usd.kernels.shadow import GLOSS, PART, RUN, STRIDE, light_places
+from icheat_usd.kernels.shadow import GLOSS, PART, STRIDE, light_places
+from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.kernels.shaping import shape_places
 from icheat_usd.lighting.controls import darken, emission_frame, without
 from icheat_usd.lighting.points import light_points
@@ -85,6 +86,7 @@ class Places:
 
     row: I32  #: (n,) point of each place
     instance: I32  #: (n,) of each point
+    bounds: F32  #: (n_runs, 4, 3)
     place: F32  #: (n_runs, 9, RUN)
     tint: F32  #: (n_runs, 3, RUN)
     gloss: F32  #: (n_lobed, 12, RUN), none where no lobe is wanted
@@ -125,7 +127,18 @@ def prepare_places(
         lobed = every[:, _ALPHA].any(axis=1)
         gloss, lobes[lobed] = every[lobed], np.arange(lobed.sum(), dtype=np.int32)
     tint = _runs(albedo / np.float32(np.pi), order)
-    return Places(row, points.instance, _runs(place, order), tint, gloss, lobes)
+    runs = _runs(place, order)
+    return Places(row, points.instance, _bounds(runs), runs, tint, gloss, lobes)
+
+
+def _bounds(runs: F32) -> F32:
+    """Least and largest origin and geometric normal (n_runs, 4, 3) of the places of each run that have a normal."""
+    there = runs[:, 3:6].any(axis=1, keepdims=True)
+    least = np.min(runs[:, :6], axis=2, initial=np.inf, where=there)
+    largest = np.max(runs[:, :6], axis=2, initial=-np.inf, where=there)
+    bounds = np.stack([least[:, :3], largest[:, :3], least[:, 3:], largest[:, 3:]], axis=1)
+    bounds[~there.any(axis=(1, 2))] = 0.0
+    return bounds
 
 
 def _runs(table: F32, order: I64 | None) -> F32:
@@ -200,9 +213,11 @@ def direct_at(
         groups.points,
         groups.first,
         groups.colors,
+        light_bounds(table),
         distant,
         seed,
         turn,
+        places.bounds,
         places.place,
         tint,
         gloss,
@@ -224,6 +239,12 @@ def direct_at(
         frame = emission_frame(snapshot, 0)
         shape_places(controls.shaping, *frame, table, distant, places.place, known, places.row, out)
     darken(snapshot, 0, places.instance, out)
+
+
+def light_bounds(table: F32) -> F32:
+    """Least and largest place and normal (4, 3) of the points of a light, a table of `light_points`."""
+    least, largest = table.min(axis=0), table.max(axis=0)
+    return np.stack([least[:3], largest[:3], least[3:6], largest[3:6]])
 
 
 class LightGroups(NamedTuple):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icheat_usd.kernels.residuals import in_lanes
 from icheat_usd.kernels.version_products import sum_atoms
 from icheat_usd.kernels.versions import CONSTANT
 from icheat_usd.relight.compiled import CompiledStack, Way
@@ -124,7 +125,7 @@ class AtomSums:
             pairs.tile,
             begin,
             np.concatenate([self.atoms[v] for v in versions]),
-            np.tile(np.pad(factors, ((0, 0), (0, 1))), (1, 16)),
+            in_lanes(factors),
             pairs.of,
             values,
         )

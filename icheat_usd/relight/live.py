@@ -522,7 +522,7 @@ class LiveRelighter:
         moved = getattr(self.lights, "moves", revision)
         if moved is None or moved != self._moves_seen:
             if self._narrow is not None:
-                self._narrow.forget()
+                self._narrow.forget(getattr(self.lights, "light_moves", None))
             self._films.forget()
         self._moves_seen = moved
 

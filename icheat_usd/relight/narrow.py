@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icheat_usd.kernels.assemble import sum_scaled
-from icheat_usd.kernels.residuals import add_light_residuals, proportions
+from icheat_usd.kernels.residuals import add_light_residuals, in_lanes, proportions
 from icheat_usd.relight.products import Products
 from icheat_usd.scene import F32, I32, I64, Bool
 from icheat_usd.transport.packed import LANES
@@ -29,15 +29,21 @@ class Narrow:
         self._products, self._exact = products, exact
         self._radiance: list[F32] = []  # that the first lights had at rest, (n_gather, 3)
         self._known: F32 = np.zeros((0, len(exact.names) * exact.n_tiles, 4 * LANES), np.float32)  # their products
-        self._is_same: Bool | None = None  # which lights still have that; None: to be found
+        self._is_same: list[bool | None] = []  # which lights still have that; None: to be found
+        self._moves: list[int] | None = None  # what `forget` was told last
         self._learnt: F32 | None = None  # of the light that is being multiplied: its first tiles
         self._n_tiles = 0  # how many of them there are
         self._n_versions = -1  # that the products are narrow for
         self._is_asked = False  # whether versions had a chance to tell what they need
 
-    def forget(self) -> None:
-        """Lights may be others now."""
-        self._is_same, self._learnt = None, None
+    def forget(self, moves: list[int] | None = None) -> None:
+        """Lights may be others now, but those that have the number in `moves` that they had the last time."""
+        if moves is None or self._moves is None:
+            self._is_same = []
+        else:
+            stays = [now == before for now, before in zip(moves, self._moves, strict=False)]
+            self._is_same = [same if stay else None for same, stay in zip(self._is_same, stays, strict=False)]
+        self._moves, self._learnt = None if moves is None else list(moves), None
         self._products.widen()
 
     def step(self, radiance: F32, gains: F32, n_versions: int) -> bool:
@@ -69,7 +75,7 @@ class Narrow:
         is_same = self._compare(radiance)
         factors = np.zeros((len(self._known), 4 * 16), np.float32)
         n = min(len(radiance), len(factors))
-        factors[:n] = np.tile(np.pad(gains[:n], ((0, 0), (0, 1))), (1, 16))
+        factors[:n] = in_lanes(gains[:n])
         n_tiles = self._exact.n_tiles
         every = np.arange(n_tiles, dtype=np.int32)
 
@@ -84,10 +90,15 @@ class Narrow:
             add(out, every)
             self._products.see(out, every)
         else:
+            moved = np.flatnonzero(~is_same).tolist()
+            rests = np.empty((len(moved), *radiance.shape[1:]), np.float32)
             rest = np.empty(radiance.shape[1:], np.float32)
-            sum_scaled(radiance[n:], gains[n:], rest)
-            for light in np.flatnonzero(~is_same[:n]).tolist():
-                rest += self._rest(light, radiance[light], gains[light], factors)
+            for i, light in enumerate(moved):
+                if light < n:
+                    self._take_known(light, radiance[light], factors, rests[i])
+                else:
+                    rests[i] = radiance[light]
+            sum_scaled(rests, np.ascontiguousarray(gains[moved], np.float32), rest)
             self._products.multiply_all(rest, out, known=add)
 
     def products_of(self, light: int) -> F32:
@@ -95,23 +106,22 @@ class Narrow:
         found: F32 = self._known[light].reshape(-1, self._exact.n_tiles, LANES, 4)
         return found
 
-    def _rest(self, light: int, radiance: F32, gain: F32, factors: F32) -> F32:
-        """What of a light under a gain is not like it was at rest; what is like it goes to `factors`."""
+    def _take_known(self, light: int, radiance: F32, factors: F32, rest: F32) -> None:
+        """Find what of a light is not like it was at rest, `rest`; what is like it goes to `factors`."""
         begin = np.arange(0, len(radiance), _PIECE)
         pieces: I64 = np.stack([0 * begin, begin, np.minimum(begin + _PIECE, len(radiance))], axis=1)
-        share, rest = np.zeros((1, 4 * 16), np.float32), np.empty_like(radiance)
+        share = np.zeros((1, 4 * 16), np.float32)
         proportions(pieces, radiance, self._radiance[light], share, rest, np.zeros((1, 2), np.float32))
         factors[light] *= share[0]
-        rest *= gain
-        return rest
 
     def _compare(self, radiance: F32) -> Bool:
         """Which lights are as they were when they were multiplied with the exact rows."""
-        if self._is_same is None or len(self._is_same) != len(radiance):
-            known = [*self._radiance, *[None] * (len(radiance) - len(self._radiance))]
-            pairs = zip(radiance, known, strict=False)
-            self._is_same = np.array([was is not None and np.array_equal(now, was) for now, was in pairs], np.bool_)
-        return self._is_same
+        del self._is_same[len(radiance) :]
+        self._is_same += [None] * (len(radiance) - len(self._is_same))
+        for light, same in enumerate(self._is_same):
+            if same is None:
+                self._is_same[light] = light < len(self._radiance) and _is_same(radiance[light], self._radiance[light])
+        return np.array(self._is_same, np.bool_)
 
     def _learn(self, radiance: F32, light: int) -> None:
         """Multiply some more tiles of exact rows with one light."""
@@ -133,5 +143,9 @@ class Narrow:
         grown[light] = self._learnt.reshape(-1, 4 * LANES)
         self._radiance[light], self._known = radiance[light].copy(), grown
         self._learnt = None
-        assert self._is_same is not None
         self._is_same[light] = True
+
+
+def _is_same(now: F32, was: F32) -> bool:
+    """Whether two lights are the same, looked at first where that takes little time."""
+    return np.array_equal(now[:_PIECE], was[:_PIECE]) and np.array_equal(now, was)

@@ -47,7 +47,7 @@ class QuickBounces:
     albedo: F32  #: (n_gather, 3)
     begin: I64  #: (n_clusters + 1,) first cell of each cluster
     share: F32  #: (n_gather,) of the cell in its cluster's area
-    blocks: F32  #: later bounces, between clusters and per colour: see `kernels.quick_bounces.reach_clusters`
+    blocks: NDArray[np.uint16]  #: later bounces, between clusters, per colour; see `kernels.reach_clusters`
     lasting: bool  #: whether there are enough bounces for a balance
     scratch: F32  #: (2, n_gather, 4) for `solve` and `follow`, which thus serve one thread at a time
     short: NDArray[np.uint64]  #: (n_gather,) as well, for light that rows reach
@@ -191,12 +191,14 @@ def _all_bounces(factors: F32, albedo: F32, n: int) -> F32:
     return total @ factors
 
 
-def _in_blocks(matrices: list[F32]) -> F32:
+def _in_blocks(matrices: list[F32]) -> NDArray[np.uint16]:
     n = len(matrices[0])
-    blocks = np.zeros((-(-n // kernels.LANES), 3, n, kernels.LANES), np.float32)
+    blocks = np.zeros((-(-n // kernels.LANES), 3, n, kernels.LANES), np.uint16)
     for channel, matrix in enumerate(matrices):
+        # The leading half of a float32, rounded to nearest, is a bfloat16.
+        short = ((np.ascontiguousarray(matrix).view(np.uint32) + 0x8000) >> 16).astype(np.uint16)
         for block, first in enumerate(range(0, n, kernels.LANES)):
-            rows = matrix[first : first + kernels.LANES]
+            rows = short[first : first + kernels.LANES]
             blocks[block, channel, :, : len(rows)] = rows.T
     return blocks
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.lanes import add_short, add_short_fours, store_short, sum_of_fours
-from icheat_usd.kernels.simd import address_of, black, load_color, store_color, zeros
+from icheat_usd.kernels.lanes import add_short, add_short_fours, load_short, store_short, sum_of_fours
+from icheat_usd.kernels.simd import address_of, black, load_color, store, store_color, zeros
 
 RNG = np.random.default_rng(5)
 BITS = 5  #: of a word that number a colour
@@ -37,6 +37,19 @@ def test_colours_are_rounded_to_the_nearest_of_eight_bits():
     assert np.all(np.abs(read - colors.astype(np.float64)) <= step / 2)
     exact = np.float32([[0.0, 1.0, -2.5, 0.0]])
     assert np.array_equal(as_float32(shortened(exact)), exact)
+
+
+def test_sixteen_short_numbers_are_read_as_they_are():
+    from numba import njit
+
+    @njit
+    def read(source, target):
+        store(address_of(target), load_short(address_of(source)))
+
+    short = RNG.integers(0, 0x7F80, 16).astype(np.uint16) | (RNG.integers(0, 2, 16) << 15).astype(np.uint16)
+    found = np.empty(16, np.float32)
+    read(short, found)
+    assert np.array_equal(found.view(np.uint32), short.astype(np.uint32) << 16)
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 4, 5, 12])

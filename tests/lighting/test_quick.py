@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from icheat_usd.kernels.shadow import is_turned_away
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
 from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
 from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
-from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, prepare_places
+from icheat_usd.lighting.points import light_points
+from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, light_bounds, prepare_places
 from icheat_usd.lighting.sampler import prepare_light_sampler
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
@@ -205,3 +209,27 @@ def test_learning_the_sky_pauses_often() -> None:
     points = on_floor(plain, 12000)
     steps = prepare_light_sampler(plain, tracer_of(plain), points, 1)
     assert sum(1 for _ in steps) > 6
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_runs_behind_a_light_are_dark_without_a_look(name: str) -> None:
+    """Of places that a light cannot reach nothing is looked at; that changes no bit, whichever way they face."""
+    snapshot = scene(LIGHTS[name], Material(0.5))
+    rng = np.random.default_rng(5)
+    mesh = np.repeat([0, 1], [1500, 2500])
+    triangle = np.where(mesh == 0, rng.integers(0, 2, 4000), 2 + rng.integers(0, len(sphere(0.25, 12)[0]), 4000))
+    uv = rng.uniform(0, 0.5, (4000, 2))
+    points = points_on_surface(snapshot, mesh, triangle, uv, rng.integers(0, 2, 4000))
+    order = np.lexsort((*points.normal.T, points.instance))
+    shadows = build_shadows(snapshot, tracer_of(snapshot))
+    places = prepare_places(snapshot, points, points.albedo, None, order)
+    bounds = np.broadcast_to(np.float32([[-9, -9, -9], [9, 9, 9], [-1, -1, -1], [1, 1, 1]]), places.bounds.shape)
+    everywhere = replace(places, bounds=np.ascontiguousarray(bounds))
+    found, looked_at = np.full((2, 4000, 3), 7, np.float32)
+    for out, some in ((found, places), (looked_at, everywhere)):
+        direct_at(snapshot, shadows, some, 5, False, out)
+    np.testing.assert_array_equal(found.view(np.uint32), looked_at.view(np.uint32))
+    assert 0.1 < (found.sum(axis=1) > 0).mean() < 0.9
+    light = light_points(snapshot, 5)
+    turned_away = [is_turned_away(some, light_bounds(light[0]), light[1]) for some in places.bounds]
+    assert 0.1 < np.mean(turned_away) < 0.9

@@ -1,0 +1,126 @@
+"""What 16 places at once get from the points of a light that they look at, and reflect of one of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.kernels._jit import kernel
+from icheat_usd.kernels.lanes import minus, ratio, root, store_whole, where_above
+from icheat_usd.kernels.simd import load, multiply_add, plus, product, spread, store, zeros
+
+RUN = 64  #: successive places that share shadow rays if that is allowed
+POINT = 7  #: columns of the table of points that are looked at for every place
+#: Floats that `look` needs for each candidate of 16 places.
+CANDIDATE = 64
+_ONE = np.float32(1.0)
+
+
+@kernel
+def look(
+    points: int, width: int, candidates: int, distant: bool, place: int, lane: int, number: Any, room: int,
+    found: int, choice_of: int,
+) -> None:  # fmt: skip
+    """What 16 places of a run, from number `lane`, get from their candidates, and which they would send a ray to.
+
+    Parameters
+    ----------
+    points, place, room, found, choice_of : addresses
+        Of the columns of the first place's candidates, each `width` floats long; of the run's columns; of `CANDIDATE`
+        floats for each candidate; of the run's rows of what is found: direction to the chosen point (for distant
+        lights) or way to it, and light; and of the number of each place's chosen candidate, int32.
+    number : 16 random numbers
+    """
+    step, at, out = width * 4, place + lane * 4, found + lane * 4
+    x, y, z = load(at), load(at + RUN * 4), load(at + RUN * 8)
+    gx, gy, gz = load(at + RUN * 12), load(at + RUN * 16), load(at + RUN * 20)
+    nx, ny, nz = load(at + RUN * 24), load(at + RUN * 28), load(at + RUN * 32)
+    none, total = zeros(), zeros()
+    for c in range(candidates):
+        point, kept = points + (c * POINT * width + lane) * 4, room + c * CANDIDATE * 4
+        dx, dy, dz, power = load(point), load(point + step), load(point + 2 * step), load(point + 6 * step)
+        if distant:
+            here = multiply_add(dx, nx, multiply_add(dy, ny, product(dz, nz)))
+            weight = product(here, power)
+        else:
+            dx, dy, dz = minus(dx, x), minus(dy, y), minus(dz, z)
+            here = multiply_add(dx, nx, multiply_add(dy, ny, product(dz, nz)))
+            away = multiply_add(
+                dx,
+                load(point + 3 * step),
+                multiply_add(dy, load(point + 4 * step), product(dz, load(point + 5 * step))),
+            )
+            square = multiply_add(dx, dx, multiply_add(dy, dy, product(dz, dz)))
+            weight = product(ratio(product(here, minus(none, away)), product(square, square)), power)
+            weight = where_above(none, away, weight, none)
+        above = multiply_add(dx, gx, multiply_add(dy, gy, product(dz, gz)))
+        weight = where_above(here, none, where_above(above, none, weight, none), none)
+        store(kept, dx)
+        store(kept + 64, dy)
+        store(kept + 128, dz)
+        store(kept + 192, weight)
+        total = plus(total, weight)
+    # the last one whose share of the total begins at or below the random number
+    wanted, begin = product(number, total), zeros()
+    dx, dy, dz, choice = zeros(), zeros(), zeros(), spread(np.float32(-1.0))
+    for c in range(candidates):
+        kept = room + c * CANDIDATE * 4
+        weight = load(kept + 192)
+        dx = _if_reached(weight, begin, wanted, load(kept), dx)
+        dy = _if_reached(weight, begin, wanted, load(kept + 64), dy)
+        dz = _if_reached(weight, begin, wanted, load(kept + 128), dz)
+        choice = _if_reached(weight, begin, wanted, spread(np.float32(c)), choice)
+        begin = plus(begin, weight)
+    store(out, dx)
+    store(out + RUN * 4, dy)
+    store(out + RUN * 8, dz)
+    store(out + RUN * 12, product(total, spread(_ONE / np.float32(candidates))))
+    store_whole(choice_of + lane * 4, choice)
+
+
+@kernel
+def _if_reached(weight: Any, begin: Any, wanted: Any, new: Any, old: Any) -> Any:
+    """Where a candidate brings something and its share begins at or below what is wanted the new, else the old."""
+    return where_above(weight, zeros(), where_above(begin, wanted, old, new), old)
+
+
+@kernel
+def shine(gloss: int, place: int, lane: int, found: int, room: int) -> None:
+    """Factors of `specular` and `specular_edge` of 16 places of a run: the GGX lobe of `kernels.bsdf.specular_terms`.
+
+    Addresses as those of `look`; `gloss` of the run's columns; the factors go to `room`, 16 floats each.
+    """
+    lobe, at, way = gloss + lane * 4, place + lane * 4, found + lane * 4
+    nx, ny, nz = load(at + RUN * 24), load(at + RUN * 28), load(at + RUN * 32)
+    lx, ly, lz = load(way), load(way + RUN * 4), load(way + RUN * 8)
+    none, one = zeros(), spread(_ONE)
+    inverse = ratio(one, root(multiply_add(lx, lx, multiply_add(ly, ly, product(lz, lz)))))
+    lx, ly, lz = product(lx, inverse), product(ly, inverse), product(lz, inverse)
+    light = multiply_add(nx, lx, multiply_add(ny, ly, product(nz, lz)))
+    hx, hy, hz = plus(lx, load(lobe + RUN * 36)), plus(ly, load(lobe + RUN * 40)), plus(lz, load(lobe + RUN * 44))
+    inverse = ratio(one, root(multiply_add(hx, hx, multiply_add(hy, hy, product(hz, hz)))))
+    hx, hy, hz = product(hx, inverse), product(hy, inverse), product(hz, inverse)
+    cosine = multiply_add(nx, hx, multiply_add(ny, hy, product(nz, hz)))
+    # the sine from the cross product, as of a narrow lobe 1 - cos^2 has no digits
+    sx, sy = minus(product(ny, hz), product(nz, hy)), minus(product(nz, hx), product(nx, hz))
+    sz = minus(product(nx, hy), product(ny, hx))
+    alpha = load(lobe + RUN * 24)
+    alpha2 = product(alpha, alpha)
+    sine2 = multiply_add(sx, sx, multiply_add(sy, sy, product(sz, sz)))
+    width = multiply_add(alpha2, product(cosine, cosine), sine2)
+    c2 = product(light, light)
+    c2 = where_above(c2, one, one, c2)
+    smith = root(multiply_add(alpha2, ratio(minus(one, c2), c2), one))
+    smith = product(spread(np.float32(0.5)), minus(smith, one))
+    below = product(plus(plus(one, load(lobe + RUN * 32)), smith), product(load(lobe + RUN * 28), light))
+    below = product(below, product(product(width, width), spread(np.float32(4.0 * math.pi))))
+    value = ratio(alpha2, below)
+    value = where_above(light, none, where_above(cosine, none, where_above(alpha, none, value, none), none), none)
+    met = multiply_add(lx, hx, multiply_add(ly, hy, product(lz, hz)))
+    grazing = minus(one, where_above(met, none, where_above(met, one, one, met), none))
+    square = product(grazing, grazing)
+    edge = product(value, product(product(square, square), grazing))
+    store(room, minus(value, edge))
+    store(room + 64, edge)
