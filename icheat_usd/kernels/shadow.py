@@ -370,9 +370,11 @@ def light_places(
     """
     n_runs = len(place)
     n_tasks = (n_runs + _RUNS - 1) // _RUNS
+    half = (n_tasks + 1) // 2
     for i in prange(n_tasks):
         # Threads take turns from first to last: what is lit may be all at one side.
-        task = 2 * i if 2 * i < n_tasks else 2 * (i - (n_tasks + 1) // 2) + 1
+        turn_of = np.int64(i)
+        task = 2 * turn_of if turn_of < half else 2 * (turn_of - half) + 1
         _light_runs(
             function, arguments, opaque, passing, points, first_point, colors, light, distant, seed, turn, bounds,
             place, tint, gloss, lobes, share_rays, phase, known, row, out, through, task * _RUNS,
