@@ -154,8 +154,8 @@ def find_missing(
     mask = (1 << column_bits) - 1
     for c in prange(len(begin) - 1):
         _find_missing(
-            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo, part, parts,
-            missing, arriving, leaves, sizes,
+            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo, part,
+            parts, missing, arriving, leaves, sizes,
         )  # fmt: skip
 
 

@@ -133,11 +133,11 @@ def prepare_places(
 
 def _bounds(runs: F32) -> F32:
     """Least and largest origin and geometric normal (n_runs, 4, 3) of the places of each run that have a normal."""
-    there = runs[:, 3:6].any(axis=1, keepdims=True)
-    least = np.min(runs[:, :6], axis=2, initial=np.inf, where=there)
-    largest = np.max(runs[:, :6], axis=2, initial=-np.inf, where=there)
+    there: Bool = np.any(runs[:, 3:6] != 0.0, axis=1)
+    least = np.min(runs[:, :6], axis=2, initial=np.inf, where=there[:, None])
+    largest = np.max(runs[:, :6], axis=2, initial=-np.inf, where=there[:, None])
     bounds = np.stack([least[:, :3], largest[:, :3], least[:, 3:], largest[:, 3:]], axis=1)
-    bounds[~there.any(axis=(1, 2))] = 0.0
+    bounds[~there.any(axis=1)] = 0.0
     return bounds
 
 
