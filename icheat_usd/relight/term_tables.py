@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from icheat_usd.kernels import terms as kernels
+from icheat_usd.kernels.soft_terms import SoftTable
 from icheat_usd.relight.compiled import Way
 from icheat_usd.relight.groups import GroupTerms, SampleGroups, Term, TermTable, reach_of
 from icheat_usd.relight.live_stack import LiveStack
 from icheat_usd.relight.products import Products
+from icheat_usd.relight.soft_samples import SoftSamples
 from icheat_usd.relight.versions import Versions
 from icheat_usd.scene import F32, I64, Bool
 
@@ -25,6 +27,7 @@ class TermTables:
         self.light = _EMPTY
         self.alike = _EMPTY  #: of those, what all samples of a group receive alike; nothing of groups that are mixed
         self.soft = _EMPTY  #: what is left of groups whose other terms have no factors but masks
+        self._soft_samples = SoftSamples()
         self.is_soft: Bool = np.zeros(0, np.bool_)  #: (n_groups,) whether something is
         self.seen: list[TermTable] = [_EMPTY] * len(self.aggregates)  #: by aggregate
         self.reach: list[TermTable] = [_EMPTY] * len(self.aggregates)  #: by aggregate
@@ -101,31 +104,16 @@ class TermTables:
         )
 
     def add_soft(self, samples: I64, masks: F32, products: Products, out: F32, values: F32 | None = None) -> None:
-        """Light of samples of groups that are soft, besides what they share; see `kernels.terms.soft_terms`.
+        """Light of samples of groups that are soft, besides what they share; see `relight.soft_samples`.
 
         Parameters
         ----------
         values
             Products of the versions with other light.
         """
-        spread, versions, table = products.interpolation, self._versions, self.soft
-        kernels.soft_terms(
-            samples,
-            self._groups.of_sample,
-            table.term_begin,
-            table.term_version,
-            table.factor_begin,
-            table.factor,
-            masks,
-            products.is_sparse,
-            spread.indptr,
-            spread.indices,
-            spread.weights,
-            versions.pair_of,
-            versions.values if values is None else values,
-            products.tints,
-            out,
-        )
+        table = SoftTable(*self.soft, masks)
+        values = self._versions.values if values is None else values
+        self._soft_samples.light(samples, self._groups.of_sample, table, self._versions.pair_of, values, products, out)
 
     def _more(self, table: TermTable, terms: Sequence[tuple[Term, ...]]) -> TermTable:
         """A table with more groups at the end."""
