@@ -11,13 +11,23 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.lanes import add_short, add_short_fours, load_short, store_short, sum_of_fours
 from icheat_usd.kernels.simd import (
     address_of,
-    color_of,
+    black,
+    channel,
+    color_add,
+    color_product,
+    difference,
     fetch,
+    load_color,
+    load_rgb,
     multiply_add,
     plus,
+    plus_size,
+    ratios,
+    scale_add,
     spread,
     store,
     store_color,
+    store_rgb,
     zeros,
 )
 
@@ -60,26 +70,46 @@ def take_change(
     leaves : (3, n_clusters) float32, mean change
     sizes : (n_clusters, 2) float32, sums of the sizes of the changes and of the direct light
     """
-    from_black, target = len(before) == 0, address_of(short)
     for c in prange(len(begin) - 1):
-        r, g, b = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        changed, all_of_it = np.float32(0.0), np.float32(0.0)
-        for i in range(begin[c], begin[c + 1]):
-            x, y, z = direct[i, 0], direct[i, 1], direct[i, 2]
-            all_of_it += abs(x) + abs(y) + abs(z)
-            light[i, 0], light[i, 1], light[i, 2], light[i, 3] = x, y, z, np.float32(0.0)
-            if not from_black:
-                x -= before[i, 0]
-                y -= before[i, 1]
-                z -= before[i, 2]
-                light[i, 0], light[i, 1], light[i, 2] = radiance[i, 0] + x, radiance[i, 1] + y, radiance[i, 2] + z
-            store_short(target + i * 8, color_of(light[i, 0], light[i, 1], light[i, 2]))
-            changed += abs(x) + abs(y) + abs(z)
-            r += share[i] * x
-            g += share[i] * y
-            b += share[i] * z
-        leaves[0, c], leaves[1, c], leaves[2, c] = r, g, b
-        sizes[c, 0], sizes[c, 1] = changed, all_of_it
+        _take_change(begin[c], begin[c + 1], np.int64(c), share, radiance, before, direct, light, short, leaves, sizes)
+
+
+@kernel
+def _take_change(
+    first: int, last: int, c: int, share: np.ndarray, radiance: np.ndarray, before: np.ndarray, direct: np.ndarray,
+    light: np.ndarray, short: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
+) -> None:  # fmt: skip
+    """`take_change` for cluster `c`, the cells from `first` up to `last`."""
+    from_black = len(before) == 0
+    radiance_0, before_0, direct_0 = address_of(radiance), address_of(before), address_of(direct)
+    light_0, short_0 = address_of(light), address_of(short)
+    mean, changed, all_of_it = black(), black(), black()
+    for i in range(first, last):
+        change = load_rgb(direct_0 + 12 * i)
+        now = change
+        all_of_it = plus_size(all_of_it, change)
+        if not from_black:
+            change = difference(change, load_rgb(before_0 + 12 * i))
+            now = scale_add(change, np.float32(1.0), load_rgb(radiance_0 + 12 * i))
+        store_color(light_0 + 16 * i, now)
+        store_short(short_0 + 8 * i, now)
+        changed = plus_size(changed, change)
+        mean = scale_add(change, share[i], mean)
+    _put_leaf(mean, leaves, c)
+    sizes[c, 0], sizes[c, 1] = _total(changed), _total(all_of_it)
+
+
+@kernel
+def _put_leaf(value: Any, leaves: np.ndarray, c: int) -> None:
+    """A colour to a column of `leaves` (3, n_clusters)."""
+    for k in range(3):
+        leaves[k, c] = channel(value, k)
+
+
+@kernel
+def _total(value: Any) -> Any:
+    """Sum of a colour's channels."""
+    return channel(value, 0) + channel(value, 1) + channel(value, 2)
 
 
 @kernel
@@ -119,6 +149,7 @@ def find_missing(
     light: np.ndarray,
     short: np.ndarray,
     albedo: np.ndarray,
+    mean_albedo: np.ndarray,
     part: int,
     parts: int,
     missing: np.ndarray,
@@ -138,6 +169,7 @@ def find_missing(
     entries : (n_entries,) uint32, of `shorten`
     direct, albedo : (n_gather, 3) float32
     light : (n_gather, 4) float32, 16-byte rows; the fourth column is 0
+    mean_albedo : (n_clusters, 3) float32
     short : (n_gather,) uint64, of `take_change`
         What the rows reach: half as long, it stays in the cache of a core.
     part, parts : int
@@ -154,54 +186,39 @@ def find_missing(
     mask = (1 << column_bits) - 1
     for c in prange(len(begin) - 1):
         _find_missing(
-            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo, part,
-            parts, missing, arriving, leaves, sizes,
+            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo,
+            mean_albedo, part, parts, missing, arriving, leaves, sizes,
         )  # fmt: skip
 
 
 @kernel
 def _find_missing(
     first: int, last: int, c: int, share: np.ndarray, indptr: np.ndarray, entries: np.ndarray, mask: int,
-    direct: np.ndarray, light: np.ndarray, short: np.ndarray, albedo: np.ndarray, part: int, parts: int,
-    missing: np.ndarray, arriving: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
+    direct: np.ndarray, light: np.ndarray, short: np.ndarray, albedo: np.ndarray, mean_albedo: np.ndarray, part: int,
+    parts: int, missing: np.ndarray, arriving: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
 ) -> None:  # fmt: skip
     """`find_missing` for cluster `c`, the cells from `first` up to `last`."""
     start, target = address_of(short), address_of(missing)
-    zero = np.float32(0.0)
-    r, g, b = zero, zero, zero
-    white_r, white_g, white_b = zero, zero, zero
-    lacking, here = zero, zero
+    direct_0, light_0, albedo_0 = address_of(direct), address_of(light), address_of(albedo)
+    mean, white, lacking, here = black(), black(), black(), black()
     begin, step = _part_of(first, last, part, parts)
     for i in range(begin, last, step):
         if step > 1 and i + step < last:
             # of a part the machine does not see which rows come next
             for e in range(indptr[i + step], indptr[i + step + 1], 16):
                 fetch(address_of(entries) + e * 4)
-        store_color(target + i * 16, _arrives(entries, indptr[i], indptr[i + 1], mask, start))
-        for k in range(3):
-            missing[i, k] = direct[i, k] - light[i, k] + albedo[i, k] * missing[i, k]
-            lacking += abs(missing[i, k])
-            here += abs(light[i, k])
-        r += share[i] * missing[i, 0]
-        g += share[i] * missing[i, 1]
-        b += share[i] * missing[i, 2]
-        white_r += share[i] * albedo[i, 0]
-        white_g += share[i] * albedo[i, 1]
-        white_b += share[i] * albedo[i, 2]
-    arriving[c, 0] = r / white_r if white_r > zero else zero
-    arriving[c, 1] = g / white_g if white_g > zero else zero
-    arriving[c, 2] = b / white_b if white_b > zero else zero
-    sizes[c, 0], sizes[c, 1] = lacking, here
+        now, reflected = load_color(light_0 + 16 * i), load_rgb(albedo_0 + 12 * i)
+        arrives = _arrives(entries, indptr[i], indptr[i + 1], mask, start)
+        lacks = color_add(reflected, arrives, difference(load_rgb(direct_0 + 12 * i), now))
+        store_color(target + 16 * i, lacks)
+        lacking, here = plus_size(lacking, lacks), plus_size(here, now)
+        mean, white = scale_add(lacks, share[i], mean), scale_add(reflected, share[i], white)
+    share_of_light = ratios(mean, white)
+    store_rgb(address_of(arriving) + 12 * c, share_of_light)
+    sizes[c, 0], sizes[c, 1] = _total(lacking), _total(here)
     if step > 1:
-        r, g, b = zero, zero, zero
-        for i in range(first, last):
-            r += share[i] * albedo[i, 0]
-            g += share[i] * albedo[i, 1]
-            b += share[i] * albedo[i, 2]
-        r *= arriving[c, 0]
-        g *= arriving[c, 1]
-        b *= arriving[c, 2]
-    leaves[0, c], leaves[1, c], leaves[2, c] = r, g, b
+        mean = color_product(load_rgb(address_of(mean_albedo) + 12 * c), share_of_light)
+    _put_leaf(mean, leaves, c)
 
 
 @parallel_kernel
@@ -221,23 +238,38 @@ def add_missing(
     short : (n_gather,) uint64, set to the same
     out : (n_gather, 3) float32, the new light once more; or no rows
     """
-    target = address_of(short)
     for c in prange(len(begin) - 1):
-        first, step = _part_of(begin[c], begin[c + 1], part, parts)
-        for i in range(begin[c], begin[c + 1]):
-            found = len(missing) > 0 and (i - first) % step == 0
-            for k in range(3):
-                arrives = later[c, k]
-                value = light[i, k]
-                if found:
-                    value += missing[i, k]
-                elif len(missing) > 0:
-                    arrives += here[c, k]
-                value += albedo[i, k] * arrives
-                light[i, k] = value
-                if len(out) > 0:
-                    out[i, k] = value
-            store_short(target + i * 8, color_of(light[i, 0], light[i, 1], light[i, 2]))
+        _add_missing(
+            begin[c], begin[c + 1], np.int64(c), albedo, missing, here, later, part, parts, light, short, out
+        )
+
+
+@kernel
+def _add_missing(
+    first: int, last: int, c: int, albedo: np.ndarray, missing: np.ndarray, here: np.ndarray, later: np.ndarray,
+    part: int, parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """`add_missing` for cluster `c`, the cells from `first` up to `last`."""
+    albedo_0, light_0, short_0 = address_of(albedo), address_of(light), address_of(short)
+    missing_0, out_0 = address_of(missing), address_of(out)
+    has_missing, has_out = len(missing) > 0, len(out) > 0
+    arrives = load_rgb(address_of(later) + 12 * c)
+    elsewhere = arrives
+    if has_missing:
+        elsewhere = scale_add(load_rgb(address_of(here) + 12 * c), np.float32(1.0), arrives)
+    found, step = _part_of(first, last, part, parts)
+    for i in range(first, last):
+        reflected, now = load_rgb(albedo_0 + 12 * i), load_color(light_0 + 16 * i)
+        if has_missing and i == found:
+            now = scale_add(load_rgb(missing_0 + 16 * i), np.float32(1.0), now)
+            now = color_add(reflected, arrives, now)
+            found += step
+        else:
+            now = color_add(reflected, elsewhere, now)
+        store_color(light_0 + 16 * i, now)
+        store_short(short_0 + 8 * i, now)
+        if has_out:
+            store_rgb(out_0 + 12 * i, now)
 
 
 @parallel_kernel

@@ -387,6 +387,20 @@ def difference(builder: Any, values: Any) -> Any:
 
 
 @_operation(color, color, color)
+def ratios(builder: Any, values: Any) -> Any:
+    """``a / b`` where `b` is above 0, and 0 in the other channels."""
+    a, b = values
+    zero = ir.Constant(_F4X, [0.0] * 4)
+    return builder.select(builder.fcmp_ordered(">", b, zero), builder.fdiv(a, b), zero)
+
+
+@_operation(types.float32, color, types.int64)
+def channel(builder: Any, values: Any) -> Any:
+    """One of the four."""
+    return builder.extract_element(values[0], values[1])
+
+
+@_operation(color, color, color)
 def plus_size(builder: Any, values: Any) -> Any:
     """``a + |b|``."""
     return builder.fadd(values[0], _size(builder, values[1], ir.VectorType(_I32, 4)))

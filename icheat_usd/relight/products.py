@@ -30,7 +30,7 @@ LEFT_OUT_OF_VERSION = 0.0015
 #: More than this is not read for light not seen before, whatever is left out.
 MOVING_BYTES = 80_000_000
 #: Terms that are looked at to find which are large: in unedited light, and in a version.
-_LOOKED_AT = 32_768, 4_096
+_LOOKED_AT = 8_192, 4_096
 #: Of light not seen before, the products of so many tiles tell how bright the image will be.
 _TILES_LOOKED_AT = 16
 #: Entries of uncompressed rows that are multiplied in one step of a refinement: some hundredths of a second.
@@ -75,18 +75,18 @@ class _Tiles:
         Where a lobe has no coefficients, `out` stays as it is: 0.
         """
         assert out.flags.c_contiguous  # a copy would be written to, and lost
-        lobe = np.repeat(np.arange(self.n_lobes), len(tile))
-        several = (self.n_lobes,)
-        tiles = np.tile(tile, several) + self.n_tiles * lobe
-        some = np.flatnonzero(~self._is_empty[tiles])
+        lobe = np.arange(self.n_lobes, dtype=np.int32)[:, None]
+        tiles, places = tile + self.n_tiles * lobe, place.astype(np.int32) + out.shape[1] * lobe
+        is_there = ~self._is_empty[tiles]
+        versions_of = np.broadcast_to(version, tiles.shape)[is_there]
         multiply_terms(
             *self._tiles,
             versions,
             size,
             least,
-            tiles[some].astype(np.int32),
-            np.tile(version, several)[some],
-            (np.tile(place, several) + out.shape[1] * lobe)[some].astype(np.int32),
+            tiles[is_there],
+            versions_of,
+            places[is_there],
             out.reshape(-1, LANES, 4),
         )
 

@@ -194,8 +194,10 @@ class LargeTerms:
             (of_lobe, sample[(sample >= first) & (sample < last)] - first)
             for of_lobe, first, last in zip(rows, begin[:-1], begin[1:], strict=True)
         ]
-        self._index = np.concatenate([of_lobe.index[some] for of_lobe, some in parts])
-        self._worth = np.concatenate([of_lobe.worth[some] for of_lobe, some in parts])
+        index = np.concatenate([of_lobe.index[some] for of_lobe, some in parts])
+        worth = np.concatenate([of_lobe.worth[some] for of_lobe, some in parts])
+        self._index, self._worth = index[index != 0], worth[index != 0]
+        self._n_roots = len(index) - len(self._index)  # which stay, whatever the light
 
     def least(self, size: F32, max_bytes: int) -> float:
         """Least ``worth * size`` of terms, so that larger ones take about `max_bytes`; roots always stay.
@@ -205,20 +207,24 @@ class LargeTerms:
         size : (n_leaves,) float32
             Largest size of each Haar coefficient of the light.
         """
-        return float(self._least(np.sort(self._terms(size)), max_bytes))
+        return float(self._least(self._terms(size), max_bytes))
 
     def least_of_error(self, size: F32, squared_error: float, max_bytes: int) -> float:
         """The same, so that squares of smaller ones sum up to `squared_error` over all pixels, or as `least` has it."""
-        terms = np.sort(self._terms(size))
+        terms = self._terms(size)
         left_out = np.cumsum(np.square(terms, dtype=np.float64)) * (self.n_terms / max(len(terms), 1))
         n_left_out = int(np.searchsorted(left_out, squared_error))
         by_error = terms[n_left_out] if n_left_out < len(terms) else np.inf
         return float(max(by_error, self._least(terms, max_bytes)))
 
     def _terms(self, size: F32) -> F32:
-        of_roots = np.append(np.float32(0), size[1:])  # which may be infinite, times a worth of 0
-        terms: F32 = np.where(self._index == 0, np.float32(np.inf), np.take(of_roots, self._index) * self._worth)
-        return terms  # roots stay
+        """Ascending; infinite ones stand for the roots."""
+        terms = np.full(len(self._index) + self._n_roots, np.inf, np.float32)
+        some = terms[: len(self._index)]
+        np.take(size, self._index, out=some, mode="clip")  # which does not copy
+        some *= self._worth
+        some.sort()
+        return terms
 
     def _least(self, terms: F32, max_bytes: int) -> float:
         """Of terms in ascending order."""

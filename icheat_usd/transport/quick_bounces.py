@@ -45,6 +45,7 @@ class QuickBounces:
     entries: np.ndarray  #: (n_entries,) uint32: column in the last `column_bits`, weight's leading bits in the others
     column_bits: int
     albedo: F32  #: (n_gather, 3)
+    mean_albedo: F32  #: (n_clusters, 3)
     begin: I64  #: (n_clusters + 1,) first cell of each cluster
     share: F32  #: (n_gather,) of the cell in its cluster's area
     blocks: NDArray[np.uint16]  #: later bounces, between clusters, per colour; see `kernels.reach_clusters`
@@ -115,6 +116,7 @@ class QuickBounces:
             light,
             self.short,
             self.albedo,
+            self.mean_albedo,
             *part,
             missing,
             arriving,
@@ -161,13 +163,14 @@ def build_quick_bounces(
     share = (tree.weight / area[cluster]).astype(np.float32)
     factors = np.zeros((len(size), len(size)), np.float32)
     kernels.merge_rows(begin, share, cluster, rows.indptr, rows.indices, rows.weights, factors)
-    albedo = np.add.reduceat(bounces.albedo * share[:, None], begin[:-1], axis=0)
+    albedo = np.add.reduceat(bounces.albedo * share[:, None], begin[:-1], axis=0, dtype=np.float32)
     matrices = [_all_bounces(factors, channel, n_bounces - 2) for channel in albedo.T]
     return QuickBounces(
         rows.indptr,
         entries,
         bits,
         bounces.albedo,
+        albedo,
         begin,
         share,
         _in_blocks(matrices),
