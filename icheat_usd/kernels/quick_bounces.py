@@ -239,9 +239,7 @@ def add_missing(
     out : (n_gather, 3) float32, the new light once more; or no rows
     """
     for c in prange(len(begin) - 1):
-        _add_missing(
-            begin[c], begin[c + 1], np.int64(c), albedo, missing, here, later, part, parts, light, short, out
-        )
+        _add_missing(begin[c], begin[c + 1], np.int64(c), albedo, missing, here, later, part, parts, light, short, out)
 
 
 @kernel
