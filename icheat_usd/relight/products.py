@@ -12,6 +12,7 @@ from icheat_usd.kernels import version_products as kernels
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
+from icheat_usd.kernels.term_energy import least_of_versions
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
 from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
@@ -132,6 +133,7 @@ class Products:
             self._large_terms, self._few_terms = (
                 LargeTerms(self._packed, n) if is_large and self._packed is not None else None for n in _LOOKED_AT
             )
+            self._energy = self._packed.term_energies() if is_large and self._packed is not None else None
             self._counts = self._weights_of_rows() if is_large else np.zeros((0, 0, LANES), np.float32)
             self._shown = 0.0  # sum over pixels of the squared unedited light that was multiplied last
             self._leaves: F32 = np.zeros((_TOGETHER, self._n_leaves, 3), np.float32)
@@ -228,8 +230,8 @@ class Products:
     def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:
         """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows.
 
-        Of a large transport, only the terms are read that are large in a large version, seen beside the unedited light;
-        see `LEFT_OUT_OF_VERSION`. Each version is seen alone, so that it does not matter which change together.
+        Of a large transport, only the terms are read that are large in a version, seen beside the unedited light; see
+        `LEFT_OUT_OF_VERSION`. Each version is seen alone, so that it does not matter which change together.
         """
         if not len(pairs):
             return
@@ -243,15 +245,17 @@ class Products:
             return
         least = np.full(len(self._versions), np.finfo(np.float32).tiny, np.float32)
         if self._large_terms is not None and not narrow:
-            for v in np.unique(version[self._is_large[version]]):
-                least[v] = max(self._least_of(int(v)), least[v])
+            self._find_least(np.unique(version), least)
         tiles.multiply(self._versions, self._sizes, least, tile, version, pairs, out)
 
-    def _least_of(self, version: int) -> float:
-        """Least terms of a version that count."""
-        assert self._few_terms is not None
+    def _find_least(self, versions: I64, least: F32) -> None:
+        """Least terms of some versions that count; of those with many cells a sample of all terms tells."""
+        assert self._few_terms is not None and self._energy is not None
         error = LEFT_OUT_OF_VERSION**2 * self._shown
-        return self._few_terms.least_of_error(self._sizes[version], error, MOVING_BYTES)
+        is_large = self._is_large[versions]
+        for v in versions[is_large]:
+            least[v] = max(self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES), least[v])
+        least_of_versions(versions[~is_large].astype(np.int64), self._sizes, *self._energy, error, least)
 
     def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
         """Products of some tiles of uncompressed rows with values (n, 3) that are 0 but at some cells."""

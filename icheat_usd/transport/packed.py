@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels import packing as kernels
 from icheat_usd.kernels.large_terms import copy_terms, find_large_terms
+from icheat_usd.kernels.term_energy import STEPS, sum_energies
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_forward
 from icheat_usd.scene import F32, F64, I32, I64
@@ -173,6 +174,14 @@ class PackedTransport:
         least = LargeTerms(self).least(size, max_bytes)
         lobes = (replace(lobe, rows=lobe.rows.of_large_terms(size, least)) for lobe in self.lobes)
         return replace(self, lobes=tuple(lobes))
+
+    def term_energies(self) -> tuple[F32, float]:
+        """Squares of all worths by coefficient and class, (n_leaves, `STEPS`), and the largest worth of all."""
+        largest = max((float(lobe.rows.worth.max(initial=0.0)) for lobe in self.lobes), default=0.0) or 1.0
+        energy = np.zeros((self.lobes[0].rows.tree.n_leaves, STEPS), np.float32)
+        for lobe in self.lobes:
+            sum_energies(lobe.rows.index, lobe.rows.worth, largest, energy)
+        return energy, largest
 
 
 class LargeTerms:
