@@ -46,7 +46,7 @@ def sum_energies(index, worth, largest, energy):  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def least_of_versions(versions, sizes, energy, largest, squared_error, least):  # type: ignore[no-untyped-def]
+def least_of_versions(versions, sizes, energy, largest, squared_error, share, least):  # type: ignore[no-untyped-def]
     """How large terms of some versions must be, so that squares of the smaller ones sum up to at most an error.
 
     Parameters
@@ -56,7 +56,8 @@ def least_of_versions(versions, sizes, energy, largest, squared_error, least):  
         Largest channels of each version's coefficients.
     energy, largest
         See `sum_energies`.
-    squared_error : float
+    squared_error, share : float
+        The error, or that share of the sum over all terms of the version, whichever is less.
     least : (n_versions,) float32
         Set for these versions: terms ``worth * size`` below may be left out. Infinite where all may, but the mean,
         which always stays.
@@ -80,10 +81,11 @@ def least_of_versions(versions, sizes, energy, largest, squared_error, least):  
                 if some > 0:
                     lowest = np.int64(math.floor(2.0 * (of_size + np.float64(first + step)))) - _LOWEST
                     sums[min(max(lowest, 0), _CLASSES - 1) if step > 0 else 0] += square * some
+        allowed = min(squared_error, share * sums.sum())
         total, found = 0.0, np.inf
         for c in range(_CLASSES):
             total += sums[c]
-            if total > squared_error:
+            if total > allowed:
                 found = 2.0 ** (0.5 * (c + _LOWEST))
                 break
         least[v] = max(np.float32(found), _TINY)

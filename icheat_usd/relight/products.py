@@ -28,6 +28,8 @@ SMALL_BYTES = 8_000_000
 LEFT_OUT = 0.003
 #: The same for each version alone, however many there are: most of them act on pixels of their own.
 LEFT_OUT_OF_VERSION = 0.0015
+#: Of a version of few cells no more is left out than this of itself, however dark it is: a stroke changes few pixels.
+LEFT_OUT_OF_ITSELF = 0.03
 #: More than this is not read for light not seen before, whatever is left out.
 MOVING_BYTES = 80_000_000
 #: Terms that are looked at to find which are large: in unedited light, and in a version.
@@ -255,7 +257,9 @@ class Products:
         is_large = self._is_large[versions]
         for v in versions[is_large]:
             least[v] = max(self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES), least[v])
-        least_of_versions(versions[~is_large].astype(np.int64), self._sizes, *self._energy, error, least)
+        least_of_versions(
+            versions[~is_large].astype(np.int64), self._sizes, *self._energy, error, LEFT_OUT_OF_ITSELF**2, least
+        )
 
     def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
         """Products of some tiles of uncompressed rows with values (n, 3) that are 0 but at some cells."""

@@ -28,14 +28,14 @@ def some_sizes() -> np.ndarray:
     return sizes
 
 
-def least_of(squared_error: float, versions: tuple[int, ...] = (0, 1, 2)) -> np.ndarray:
+def least_of(squared_error: float, versions: tuple[int, ...] = (0, 1, 2), share: float = 1.0) -> np.ndarray:
     index, worth = some_terms()
     energy = np.zeros((N_LEAVES, STEPS), np.float32)
     largest = float(worth.max())
     sum_energies(index, worth, largest, energy)
     np.testing.assert_allclose(energy.sum(axis=1), np.bincount(index, worth.astype(np.float64) ** 2), rtol=1e-5)
     least = np.full(3, -1, np.float32)
-    least_of_versions(np.array(versions, np.int64), some_sizes(), energy, largest, squared_error, least)
+    least_of_versions(np.array(versions, np.int64), some_sizes(), energy, largest, squared_error, share, least)
     return least
 
 
@@ -53,8 +53,15 @@ def test_what_is_left_out_is_at_most_the_error_and_not_much_less(version: int, s
     least = float(least_of(squared_error)[version])
     assert np.finfo(np.float32).tiny < least < np.inf
     assert squares_below(version, least) <= squared_error * (1 + 1e-5)
+    assert least_of(np.inf, share=share)[version] == pytest.approx(least, rel=0.5)
     # A class counts as a whole, and ends at twice its beginning; so do the steps of what is found.
     assert squares_below(version, 4 * least) > squared_error
+
+
+def test_a_version_keeps_its_own_shape_however_dark_it_is_beside_the_image() -> None:
+    for version in (0, 1):
+        least = float(least_of(1e12, share=1e-3)[version])
+        assert 0 < squares_below(version, least) <= 1.001e-3 * squares_below(version, np.inf)
 
 
 def test_where_all_of_it_is_small_the_mean_alone_stays() -> None:
