@@ -107,3 +107,28 @@ def test_libraries_options_and_the_processor_are_in_the_digest() -> None:
         assert part in facts
     assert _jit.closure_digest("rows", facts=facts) == _jit.closure_digest("rows")
     assert _jit.closure_digest("rows", facts=facts + "+avx9") != _jit.closure_digest("rows")
+
+
+@pytest.mark.parametrize("step", ["_save_index", "_save_data", "_load_index"])
+def test_what_two_processes_keep_at_the_same_moment_is_not_mixed_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """One comes between two steps of the other; each has looked at the index before the other wrote to it."""
+    first, second = (_jit._Files(str(tmp_path), "kernel-1.py311", "digest") for _ in range(2))
+    as_it_is = getattr(first, step)
+
+    def interrupted(*arguments: object) -> object:
+        done = as_it_is(*arguments)
+        with monkeypatch.context() as patch:
+            patch.setattr(second, "_load_index", dict)
+            second.save(("float64",), "compiled for float64")
+        return done
+
+    with monkeypatch.context() as patch:
+        patch.setattr(first, step, interrupted)
+        first.save(("int64",), "compiled for int64")
+    for kind in ("int64", "float64"):
+        assert first.load((kind,)) in (None, f"compiled for {kind}")
+        first.save((kind,), f"compiled for {kind}")
+    for kind in ("int64", "float64"):
+        assert second.load((kind,)) == f"compiled for {kind}"

@@ -138,8 +138,29 @@ class _Compiled(caching.CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = [_FolderOfContents, *caching.CompileResultCacheImpl._locator_classes]
 
 
+class _Files(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """What is kept of one kernel: an index by types, and a file for each.
+
+    Numba counts the files, and two processes that keep something at the same moment can give both the same name: one
+    of the types is then served what was compiled for the other, for ever. Here the types make the name. The file is
+    there before the index says so; what of the index gets lost is compiled again.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        digest = hashlib.sha256(caching.dumps(key)).digest()
+        name = self._data_name(int.from_bytes(digest[:8], "big"))
+        self._save_data(name, data)
+        names = self._load_index()
+        if names.get(key) != name:
+            self._save_index({**names, key: name})
+
+
 class _Cache(caching.FunctionCache):  # type: ignore[misc]
     _impl_class = _Compiled
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _Files(self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
 
 
 def _compile(function: Function, **options: Any) -> Function:
