@@ -214,24 +214,30 @@ def test_unusable_stages_give_one_clear_error(tmp_path, content, complaint):
 
 @pytest.mark.parametrize("placing", ["moved by 10 km", "in millimetres", "in kilometres"])
 def test_where_and_in_which_unit_a_room_stands_does_not_matter(tmp_path, placing):
-    """The same floats but for rounding, hence the same rays: only a ray at an edge may fall on the other side."""
+    """The same floats but for rounding, hence the same rays: only a ray at an edge may fall on the other side.
+
+    From the middle of the room two pixels look at the very edges of the block, where the side that is seen, and with
+    it where gather samples go, is a matter of rounding; hence the camera is moved a little.
+    """
+    own = ROOM.replace("(0, 0, 1.9)", "(0.031, 0.017, 1.9)")
     room = {
-        "moved by 10 km": ROOM.replace(
+        "moved by 10 km": own.replace(
             'def Xform "World"\n{',
             'def Xform "World"\n{\n    double3 xformOp:translate = (10000, -300, 10000)\n'
             '    uniform token[] xformOpOrder = ["xformOp:translate"]',
         ),
-        "in millimetres": ROOM.replace("metersPerUnit = 1\n", "metersPerUnit = 0.001\n"),
-        "in kilometres": ROOM.replace("metersPerUnit = 1\n", "metersPerUnit = 1000\n"),
+        "in millimetres": own.replace("metersPerUnit = 1\n", "metersPerUnit = 0.001\n"),
+        "in kilometres": own.replace("metersPerUnit = 1\n", "metersPerUnit = 1000\n"),
     }[placing]
-    assert room != ROOM
+    assert own != ROOM and room != own
     films = []
-    for name, text in (("here", ROOM), ("there", room)):
+    for name, text in (("here", own), ("there", room)):
         (tmp_path / f"{name}.usda").write_text(text)
         session = Session.open(tmp_path / f"{name}.usda", width=24, height=18, quality=QUALITY)
         films.append((session.relight(), session.render(GatherSettings(1, 16, 4))))
-    for here, there in zip(*films, strict=True):
+    # Where records of the final gather go hangs on the order of floats that are all but equal.
+    for here, there, most in zip(*films, (1e-4, 0.01), strict=True):
         ours, theirs = here.layer("beauty").mean(axis=2), there.layer("beauty").mean(axis=2)
         assert ours.mean() > 0.05
-        assert np.quantile(np.abs(theirs / ours - 1), 0.95) < 0.01
-        assert theirs.mean() == pytest.approx(ours.mean(), rel=5e-3)
+        assert np.quantile(np.abs(theirs / ours - 1), 0.95) < most
+        assert theirs.mean() == pytest.approx(ours.mean(), rel=most / 2)

@@ -22,7 +22,7 @@ ENGINES: dict[str, Build] = {
     "embree with instances": lambda snapshot: EmbreeTracer(snapshot, copied_triangles=0),
     "reference": ReferenceTracer,
 }
-PLACED_FAR_AWAY = [translation(1e4 + i, 0, 0) for i in range(INSTANCES_FOR_PACKETS + 1)]
+PLACED_BESIDE = [translation(8 + 0.001 * i, 0, 0) for i in range(INSTANCES_FOR_PACKETS + 1)]
 
 
 @pytest.fixture(params=ENGINES)
@@ -87,6 +87,30 @@ def test_no_ray_leaks_through_the_shared_edges_of_a_closed_mesh(build: Build) ->
     assert tracer.occluded(np.zeros_like(inside), inside).all()
 
 
+@pytest.mark.parametrize("engine", ["embree", "embree with instances"])
+@pytest.mark.parametrize("place", [(0, 0, 0), (30, 20, 50)], ids=["near", "far"])
+@pytest.mark.parametrize("fineness", [4, 150], ids=["coarse", "fine"])
+def test_no_ray_aimed_at_an_edge_passes_between_two_triangles(
+    engine: str, place: tuple[float, float, float], fineness: int
+) -> None:
+    stretched = scaling(1.3, 0.4, 1.0) if engine == "embree with instances" else np.eye(4)
+    matrix = translation(*place) @ rotation((1, 2, 3), 40) @ stretched
+    points, _ = sphere(1.0, fineness)
+    away = translation(0, 5, 0) @ matrix  # placed twice, so that it can be an instance
+    tracer = ENGINES[engine](make_snapshot([Mesh(points, transforms=[matrix, away])]))
+    world = points @ matrix[:3, :3].T + matrix[:3, 3]
+    rng = np.random.default_rng(fineness)
+    n = 300_000
+    first = rng.integers(3, size=n)
+    triangle, along = world[rng.integers(len(world), size=n)], rng.random((n, 1))
+    rows_of = np.arange(n)
+    target = triangle[rows_of, first] * along + triangle[rows_of, (first + 1) % 3] * (1 - along)
+    origin = np.asarray(place, np.float32) + rng.uniform(-0.1, 0.1, (n, 3)).astype(np.float32)
+    direction = (target - origin).astype(np.float32)
+    assert (tracer.intersect(origin, direction).distance < 1.01).all()
+    assert tracer.occluded(origin, direction, 1.01).all()
+
+
 def test_instances_carry_their_own_number_and_the_rows_of_their_mesh(build: Build) -> None:
     first, second = Mesh(box(1)), Mesh(box(0.5), transforms=[translation(-3, 0, 0), translation(3, 0, 0)])
     tracer = build(make_snapshot([first, second]))
@@ -113,7 +137,7 @@ def test_embree_finds_what_the_reference_finds_in_a_soup_of_mirrored_and_skewed_
     limits = rng.uniform(0.1, 2.0, 4000).astype(np.float32)
     slow = ReferenceTracer(snapshot)
     if engine == "single rays":  # chosen for scenes of many instances: these are out of the way
-        meshes.append(Mesh(box(0.1), transforms=PLACED_FAR_AWAY))
+        meshes.append(Mesh(box(0.1), transforms=PLACED_BESIDE))
         fast: Tracer = EmbreeTracer(make_snapshot(meshes), copied_triangles=0)
     else:
         fast = ENGINES[engine](snapshot)
