@@ -40,13 +40,13 @@ PREVIEW = Quality()
 #: would show.
 RECORDS = replace(PREVIEW, record_error=0.01, rays_per_bounce_row=256)
 
-#: The same, packed so that a frame takes milliseconds. Lights that an artist sets lose a fifth of what plausible lights
-#: lose, among which are beams on few cells; what is lost beyond this is noise of the rows.
-LIVE = replace(RECORDS, packing_error=0.05)
+#: The same, packed so that a frame takes milliseconds. Lights that an artist sets lose a third to all of what plausible
+#: lights lose, among which are beams on few cells; what is lost beyond this is noise of the rows.
+LIVE = replace(RECORDS, packing_error=0.03)
 
 #: For a close look at what lives on.
 LIVE_FINE = replace(
-    LIVE, record_error=0.005, record_share=0.35, record_rays=4096, rays_per_bounce_row=1024, packing_error=0.025
+    LIVE, record_error=0.005, record_share=0.35, record_rays=4096, rays_per_bounce_row=1024, packing_error=0.015
 )
 FINAL = GatherSettings()
 

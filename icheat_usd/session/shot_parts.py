@@ -34,9 +34,6 @@ Part = TypeVar("Part")
 #: Records that any image may have, however small it is.
 FEWEST_RECORDS = 8_192
 
-#: Plausible lights that coefficients are chosen by; more of them help where records stand, and cost time here.
-PACKING_LIGHTS = 48
-
 #: Photons that leave lights, for each gather sample.
 PHOTONS_PER_CELL = 16
 
@@ -155,8 +152,7 @@ class ShotParts:
             raise ValueError("this quality asks for exact rows; give it a packing_error")
 
         def make(_: Shelf | None) -> PackedTransport:
-            lights = self.training[:PACKING_LIGHTS]
-            packed = pack(self.transport, self.gather, lights, error, progress=self.progress)
+            packed = pack(self.transport, self.gather, self.training, error, progress=self.progress)
             # The exact rows have a shelf of their own.
             return replace(packed, source=None)
 

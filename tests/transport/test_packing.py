@@ -105,6 +105,27 @@ def test_lights_that_were_not_trained_on_are_about_as_far_off_as_asked_for(
     assert sizes[0] < sizes[1]
 
 
+def test_lights_that_the_view_hardly_sees_do_not_tell_how_much_to_keep(
+    scene: tuple[ClusterTree, F32, Transport],
+) -> None:
+    """Beams onto cells that hardly any ray meets: none knows another's, so each would be wrong by all that there is."""
+    tree, position, _ = scene
+    rows = smooth_rows(position)
+    hidden = np.arange(100, 130)
+    rows = replace(rows, weights=rows.weights * np.where(np.isin(rows.indices, hidden), np.float32(1e-4), 1))
+    transport = transport_of(rows)
+    training = lights(position, 24, 2)
+    beams = np.full((len(hidden), N_LEAVES), 1e-9, np.float32)
+    beams[np.arange(len(hidden)), hidden] = 10
+    alone, both = (pack_on_tree(transport, tree, some, 0.03) for some in (training, np.concatenate([training, beams])))
+    assert alone.report is not None and both.report is not None
+    assert len(both.report.light_error) == len(alone.report.light_error) == 24
+    assert both.report.error == pytest.approx(0.03, rel=0.2)
+    # Where nothing but such beams is known, they do.
+    only = pack_on_tree(transport, tree, beams, 0.03)
+    assert only.report is not None and len(only.report.light_error) == len(hidden)
+
+
 def test_uniform_light_stays_right_however_little_is_kept(scene: tuple[ClusterTree, F32, Transport]) -> None:
     tree, position, transport = scene
     packed = pack_on_tree(transport, tree, lights(position, 8, 2), 0.2)

@@ -17,7 +17,7 @@ from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.session.document import Session
 from icheat_usd.session.frames import SharedParts
 from icheat_usd.session.quality import PREVIEW, Quality
-from icheat_usd.session.shot_parts import PACKING_LIGHTS, ShotParts
+from icheat_usd.session.shot_parts import ShotParts
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport import Transport
 from icheat_usd.transport.packed import PackedTransport
@@ -104,7 +104,7 @@ class Parts:
 
     def pack(self, tolerance: float) -> PackedTransport:
         """The transport packed to another tolerance than the preview's own."""
-        return pack(self.transport, self.gather, self._shot.training[:PACKING_LIGHTS], tolerance)
+        return pack(self.transport, self.gather, self._shot.training, tolerance)
 
     @cached_property
     def lights(self) -> LiveLights:
