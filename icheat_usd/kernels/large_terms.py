@@ -36,7 +36,7 @@ from icheat_usd.kernels.simd import (
 
 _PARTS = 32
 _AT_ONCE = 256  # pairs of coefficients: their quanta stay in the second-level cache until they are multiplied
-_QUANTA = 2 * LANES  # bytes of a pair of coefficients
+QUANTA = 2 * LANES  #: bytes of a pair of coefficients
 
 
 @kernel
@@ -108,10 +108,10 @@ def _multiply_pairs(first, end, count, number, value, words, steps, sums):  # ty
     r0 = r1 = r2 = r3 = g0 = g1 = g2 = g3 = b0 = b1 = b2 = b3 = no_sum()
     base, place, last = address_of(value), address_of(words), np.uint64(count - 1)
     for i in range(np.uint64(first), np.uint64(end)):
-        ahead = base + _QUANTA * np.int64(number[min(i + np.uint64(_AT_ONCE), last)])
+        ahead = base + QUANTA * np.int64(number[min(i + np.uint64(_AT_ONCE), last)])
         fetch(ahead)
         fetch(ahead + 64)
-        quanta = base + _QUANTA * np.int64(number[i])
+        quanta = base + QUANTA * np.int64(number[i])
         r, g, b = spread_pair(place), spread_pair(place + 4), spread_pair(place + 8)
         x = widen(quanta)
         r0, g0, b0 = add_dot(x, r, r0), add_dot(x, g, g0), add_dot(x, b, b0)
@@ -139,8 +139,14 @@ def _multiply_pairs(first, end, count, number, value, words, steps, sums):  # ty
 
 
 @kernel
-def _multiply_tile(count, number, index, scale, value, coefficients, room, out):  # type: ignore[no-untyped-def]
-    """Some pairs of coefficients of one tile times one version; `room` (3 _AT_ONCE + 67, 4) is work space."""
+def new_room():  # type: ignore[no-untyped-def]
+    """Work space of `multiply_tile`: one allocation, since six cost as much as a tile."""
+    return np.empty((3 * _AT_ONCE + 67, 4), np.float32)
+
+
+@kernel
+def multiply_tile(count, number, index, scale, value, coefficients, room, out):  # type: ignore[no-untyped-def]
+    """Some pairs of coefficients of one tile times one version; `room` is from `new_room`."""
     n = _AT_ONCE + 4  # `round_pairs` works in whole vectors
     even, odd, words = room[:n], room[n : 2 * n], room[2 * n : 3 * n]
     bounds, steps, per_step = room[3 * n : 3 * n + 2], room[3 * n + 2], room[3 * n + 3 : 3 * n + 7].reshape(16)
@@ -166,7 +172,7 @@ def _multiply_run(  # type: ignore[no-untyped-def]
     for job in range(first, last):
         most = max(most, tile_begin[job_tile[job] + 1] - tile_begin[job_tile[job]])
     number = np.empty(most + 18, np.int32)
-    room = np.empty((3 * _AT_ONCE + 67, 4), np.float32)  # one allocation: six cost as much as a tile
+    room = new_room()
     for job in range(first, last):
         version = job_version[job]
         begin, end = tile_begin[job_tile[job]], tile_begin[job_tile[job] + 1]
@@ -174,7 +180,7 @@ def _multiply_run(  # type: ignore[no-untyped-def]
             count = _find_large_pairs(begin, end, index, worth, size[version], least[version], number)
         else:
             count = _all_pairs(begin, end, number)
-        _multiply_tile(count, number, index, scale, value, coefficients[version], room, out[job_out[job]])
+        multiply_tile(count, number, index, scale, value, coefficients[version], room, out[job_out[job]])
 
 
 @parallel_kernel

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import version_products as kernels
+from icheat_usd.kernels.found_terms import TermColumns, find_terms, multiply_found, order_terms
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
@@ -28,8 +29,8 @@ SMALL_BYTES = 8_000_000
 LEFT_OUT = 0.003
 #: The same for each version alone, however many there are: most of them act on pixels of their own.
 LEFT_OUT_OF_VERSION = 0.0015
-#: Of a version of few cells no more is left out than this of itself, however dark it is: a stroke changes few pixels.
-LEFT_OUT_OF_ITSELF = 0.03
+#: No more is left out of a version than this of itself, however dark it is: a stroke changes few pixels.
+LEFT_OUT_OF_ITSELF = 0.005
 #: More than this is not read for light not seen before, whatever is left out.
 MOVING_BYTES = 80_000_000
 #: Terms that are looked at to find which are large: in unedited light, and in a version.
@@ -71,27 +72,55 @@ class _Tiles:
         self._tiles: PairedTiles = join_tiles(parts)
         # Also of what is narrower, so that nothing that was there before stays.
         self._is_empty: Bool = np.diff(self._tiles.tile_begin) == 0 if narrow_of is None else narrow_of._is_empty
+        self._columns: TermColumns | None = None  # made for the first versions of few cells
 
-    def multiply(self, versions: F32, size: F32, least: F32, tile: I32, version: I32, place: I64, out: F32) -> None:
+    def multiply(
+        self,
+        versions: F32,
+        size: F32,
+        least: F32,
+        tile: I32,
+        version: I32,
+        place: I64,
+        out: F32,
+        has_few: Bool | None = None,
+    ) -> None:
         """Products of pairs of tile and version, to ``out[:, place]`` (n_lobes, n, 64, 4); `least` may be empty.
 
-        Where a lobe has no coefficients, `out` stays as it is: 0.
+        No pair is there twice. Where a lobe has no coefficients, `out` stays as it is: 0. Versions with few large
+        terms (n_versions,) are done in less time, and with the same bits, if they are known.
         """
         assert out.flags.c_contiguous  # a copy would be written to, and lost
         lobe = np.arange(self.n_lobes, dtype=np.int32)[:, None]
         tiles, places = tile + self.n_tiles * lobe, place.astype(np.int32) + out.shape[1] * lobe
         is_there = ~self._is_empty[tiles]
-        versions_of = np.broadcast_to(version, tiles.shape)[is_there]
-        multiply_terms(
-            *self._tiles,
-            versions,
-            size,
-            least,
-            tiles[is_there],
-            versions_of,
-            places[is_there],
-            out.reshape(-1, LANES, 4),
-        )
+        jobs = tiles[is_there], np.broadcast_to(version, tiles.shape)[is_there], places[is_there]
+        flat = out.reshape(-1, LANES, 4)
+        if has_few is not None:
+            few = has_few[jobs[1]]
+            if few.any():
+                found, jobs = ((jobs[0][some], jobs[1][some], jobs[2][some]) for some in (few, ~few))
+                self._multiply_found(versions, size, least, *found, flat)
+        multiply_terms(*self._tiles, versions, size, least, *jobs, flat)
+
+    def _multiply_found(
+        self, versions: F32, size: F32, least: F32, tile: I32, version: I32, place: I32, out: F32
+    ) -> None:
+        if self._columns is None:
+            self._columns = order_terms(self._tiles, versions.shape[1])
+        n = len(tile)
+        is_used = np.zeros(len(versions), np.bool_)
+        is_used[version] = True
+        used = np.flatnonzero(is_used)
+        job_of = np.full((len(used), len(self._tiles.tile_begin) - 1), -1, np.int32)
+        job_of[(np.cumsum(is_used) - 1)[version], tile] = np.arange(n)
+        begin = np.zeros(n + 1, np.int64)
+        find_terms(*self._columns, size, least, used, job_of, begin[1:], np.empty(0, np.int32))
+        np.cumsum(begin, out=begin)
+        found = np.empty(begin[-1], np.int32)
+        find_terms(*self._columns, size, least, used, job_of, begin[:-1].copy(), found)
+        _, index, scale, _, value = self._tiles
+        multiply_found(index, scale, value, versions, begin, found, version, place, out)
 
 
 class Products:
@@ -246,9 +275,11 @@ class Products:
                 out[lobe, pairs] = into
             return
         least = np.full(len(self._versions), np.finfo(np.float32).tiny, np.float32)
+        has_few = None
         if self._large_terms is not None and not narrow:
             self._find_least(np.unique(version), least)
-        tiles.multiply(self._versions, self._sizes, least, tile, version, pairs, out)
+            has_few = ~self._is_large
+        tiles.multiply(self._versions, self._sizes, least, tile, version, pairs, out, has_few)
 
     def _find_least(self, versions: I64, least: F32) -> None:
         """Least terms of some versions that count; of those with many cells a sample of all terms tells."""
@@ -256,7 +287,8 @@ class Products:
         error = LEFT_OUT_OF_VERSION**2 * self._shown
         is_large = self._is_large[versions]
         for v in versions[is_large]:
-            least[v] = max(self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES), least[v])
+            of_itself = self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES, LEFT_OUT_OF_ITSELF**2)
+            least[v] = max(of_itself, least[v])
         least_of_versions(
             versions[~is_large].astype(np.int64), self._sizes, *self._energy, error, LEFT_OUT_OF_ITSELF**2, least
         )

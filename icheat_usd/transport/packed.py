@@ -218,11 +218,15 @@ class LargeTerms:
         """
         return float(self._least(self._terms(size), max_bytes))
 
-    def least_of_error(self, size: F32, squared_error: float, max_bytes: int) -> float:
-        """The same, so that squares of smaller ones sum up to `squared_error` over all pixels, or as `least` has it."""
+    def least_of_error(self, size: F32, squared_error: float, max_bytes: int, share: float = 1.0) -> float:
+        """The same, so that squares of smaller ones sum up to `squared_error` over all pixels, or as `least` has it.
+
+        They sum up to no more than `share` of all squares but the roots'.
+        """
         terms = self._terms(size)
         left_out = np.cumsum(np.square(terms, dtype=np.float64)) * (self.n_terms / max(len(terms), 1))
-        n_left_out = int(np.searchsorted(left_out, squared_error))
+        all_but_roots = float(left_out[len(self._index) - 1]) if len(self._index) else 0.0
+        n_left_out = int(np.searchsorted(left_out, min(squared_error, share * all_but_roots)))
         by_error = terms[n_left_out] if n_left_out < len(terms) else np.inf
         return float(max(by_error, self._least(terms, max_bytes)))
 

@@ -13,6 +13,7 @@ import pytest
 from icheat_usd.edits.model import Blend, Edit, EditStack, KeyedPayload, Payload, SurfaceMask
 from icheat_usd.errors import EditError
 from icheat_usd.relight.live import LiveRelighter
+from icheat_usd.relight.products import _Tiles
 from icheat_usd.scene import F32
 from icheat_usd.transport import sum_lights
 from icheat_usd.transport.packed import PackedLobe, PackedTransport
@@ -503,6 +504,33 @@ def test_a_large_transport_is_read_in_part_while_lights_move(monkeypatch):
     assert (large > 3 * small).all()
     assert (large < 5 * 0.1).all()
     assert (limited > large).all()
+
+
+def test_edits_of_few_cells_are_read_in_part_and_change_what_they_should(monkeypatch):
+    """What is left out is a small share of each edit; its terms are found without a look at all others."""
+    of, rows = pipeline("full"), poor(packed("full"))
+    strong = EditStack("/stack", (edit("a", "scale", select("/floor"), select("/back", "/floor")),))
+    weak = EditStack("/stack", (edit("a", "scale", select("/tall"), select("/red", "/green")),))
+
+    def change(stack: EditStack, of_image: float, of_itself: float) -> F32:
+        """Of light that moved since the first frame, which tells how bright the image is."""
+        monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT_OF_VERSION", of_image)
+        monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT_OF_ITSELF", of_itself)
+        shown = fresh_packed(of, rows, stack, np.ones((2, 3), np.float32))
+        shown.frame()
+        shown.lights.set_gain(0, 0.7)
+        seen = shown.relit()
+        return seen.indirect_edited - seen.indirect
+
+    monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
+    monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", 0.0)
+    assert 0 < rms_of(change(strong, 1.0, 0.1), change(strong, 0.0, 0.0)) < 0.1
+    # Beside the image, this edit is nothing: all of it could go.
+    assert rms_of(change(weak, 1.0, 1.0), change(weak, 0.0, 0.0)) > 1
+    assert rms_of(change(weak, 1.0, 0.1), change(weak, 0.0, 0.0)) < 0.1
+    found, multiply = change(strong, 1.0, 0.1), _Tiles.multiply
+    monkeypatch.setattr(_Tiles, "multiply", lambda tiles, *given: multiply(tiles, *given[:7]))
+    np.testing.assert_array_equal(change(strong, 1.0, 0.1), found)
 
 
 def test_a_light_that_goes_down_at_once_has_the_terms_that_are_large_in_what_is_left(monkeypatch):

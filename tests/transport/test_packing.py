@@ -14,6 +14,7 @@ from icheat_usd.samples.wavelets import haar_forward
 from icheat_usd.scene import F32
 from icheat_usd.transport import PackedTransport, SparseRows, Transport, lossless, residual
 from icheat_usd.transport.build import Lobe
+from icheat_usd.transport.packed import LargeTerms
 from icheat_usd.transport.packing import pack_on_tree
 
 N_LEAVES, N_ROWS = 900, 300  # four tiles and a part of one
@@ -212,3 +213,16 @@ def test_training_light_of_other_cells_is_refused(scene: tuple[ClusterTree, F32,
     tree, position, transport = scene
     with pytest.raises(ValueError, match="gather samples"):
         pack_on_tree(transport, tree, lights(position, 8, 2)[:, 1:], 0.05)
+
+
+def test_what_is_left_out_of_a_light_is_a_share_of_its_terms(scene: tuple[ClusterTree, F32, Transport]) -> None:
+    tree, position, transport = scene
+    packed = pack_on_tree(transport, tree, lights(position, 8, 2), 0.02)
+    size = np.abs(haar_forward(tree, lights(position, 1, 5)[0])).astype(np.float32)
+    rows = packed.lobes[0].rows
+    terms = np.sort((rows.worth * size[rows.index])[rows.index != 0])
+    for share in (0.001, 0.1):
+        least = LargeTerms(packed, 10**9).least_of_error(size, np.inf, 10**12, share)
+        left_out = np.count_nonzero(terms < np.float32(least))
+        squares = np.cumsum(terms.astype(np.float64) ** 2) / np.sum(terms.astype(np.float64) ** 2)
+        assert squares[left_out - 1] <= share < squares[left_out]
