@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.large_terms import QUANTA, multiply_tile, new_room
-from icheat_usd.kernels.packed import PairedTiles, share
+from icheat_usd.kernels.packed import PARTS, PairedTiles, share
 from icheat_usd.kernels.simd import address_of, fetch
 
-_PARTS = 32
 _FEW = 24  # numbers that are sorted by inserting each
 _AHEAD = 64  # pairs whose quanta are on their way to the cache while the product before them is made
 _COST = 64  # of a product, beside its pairs of coefficients
@@ -168,8 +167,8 @@ def multiply_found(  # type: ignore[no-untyped-def]
     """
     n = len(job_version)
     cost_end = found_begin[1:] + _COST * np.arange(1, n + 1)
-    for turn in prange(_PARTS):
-        part = 2 * turn % _PARTS + 2 * turn // _PARTS
+    for turn in prange(PARTS):
+        part = 2 * turn % PARTS + 2 * turn // PARTS
         first, last = share(cost_end, part), share(cost_end, part + 1)
         room = new_room()
         if first < last:

@@ -12,7 +12,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.packed import LANES, choose_steps, round_pairs, share, sum_costs
+from icheat_usd.kernels.packed import LANES, PARTS, choose_steps, round_pairs, share, sum_costs
 from icheat_usd.kernels.simd import (
     add_dot,
     address_of,
@@ -34,7 +34,6 @@ from icheat_usd.kernels.simd import (
     widen,
 )
 
-_PARTS = 32
 _AT_ONCE = 256  # pairs of coefficients: their quanta stay in the second-level cache until they are multiplied
 QUANTA = 2 * LANES  #: bytes of a pair of coefficients
 
@@ -213,9 +212,9 @@ def multiply_terms(  # type: ignore[no-untyped-def]
     tile's coefficients, so a product has the same bits whatever other jobs or threads there are.
     """
     cost_end = sum_costs(tile_begin, job_tile)
-    for turn in prange(_PARTS):
+    for turn in prange(PARTS):
         # Threads take turns from left to right: what is lit may lie on one side of the image.
-        part = 2 * turn % _PARTS + 2 * turn // _PARTS
+        part = 2 * turn % PARTS + 2 * turn // PARTS
         first, last = share(cost_end, part), share(cost_end, part + 1)
         _multiply_run(
             tile_begin,

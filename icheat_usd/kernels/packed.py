@@ -31,7 +31,7 @@ from icheat_usd.kernels.simd import (
 )
 
 LANES = 64  # rows of a tile: four vectors of sums for each of three channels stay in registers
-_PARTS = 32  # runs of equal work: threads take equal shares of the parts, one behind the other
+PARTS = 32  #: runs of equal work: threads take equal shares of the parts, one behind the other
 _LARGEST_WORD = 32767.0
 _LARGEST_SUM = 2.0**31 / 128 * (1 - 1e-3)  # of the sizes of a tile's words: no sum with quanta overflows 32 bits
 
@@ -141,9 +141,9 @@ def sum_costs(tile_begin, pair_tile):  # type: ignore[no-untyped-def]
 @kernel
 def share(cost_end, part):  # type: ignore[no-untyped-def]
     """First item of a part when items are divided into runs of equal cost; `cost_end` (n,) sums the costs."""
-    if part == _PARTS or len(cost_end) == 0:
+    if part == PARTS or len(cost_end) == 0:
         return len(cost_end)
-    return np.searchsorted(cost_end, cost_end[-1] * part / _PARTS, side="right")
+    return np.searchsorted(cost_end, cost_end[-1] * part / PARTS, side="right")
 
 
 @kernel
@@ -195,6 +195,6 @@ def multiply_tiles(  # type: ignore[no-untyped-def]
     bits whatever other pairs or threads there are.
     """
     cost_end = sum_costs(tile_begin, pair_tile)
-    for part in prange(_PARTS):
+    for part in prange(PARTS):
         first, last = share(cost_end, part), share(cost_end, part + 1)
         _multiply_run(tile_begin, index, scale, value, coefficients, pair_tile, pair_version, first, last, out)
