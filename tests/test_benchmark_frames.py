@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tools.benchmarking import frames
+from tools.benchmarking.pace import Pace
 
 
 def amounts_of(n_edits: int, last: Callable[[], float] = lambda: 0.0) -> Callable[[], Callable[[int], Any]]:
@@ -69,3 +70,18 @@ def test_what_takes_too_long_is_broken_off() -> None:
         pass
     assert signal.getsignal(signal.SIGALRM) is before
     assert frames._cell({"broken_off_after": 240.0}) == "slower than 240 s"
+
+
+def test_speed_of_the_machine_stands_beside_frames() -> None:
+    pace = Pace()
+    assert pace.as_dict() == {"2": {}, "1": {}}
+    pace.look()
+    speeds = pace.as_dict()
+    for threads in ("2", "1"):
+        # One lane at 0.1 GHz, and sixteen at 10 with two units: what is outside is an error of units.
+        assert 0.1 < speeds[threads]["GFLOP/s"] < 2 * 640 and 0.1 < speeds[threads]["GB/s"] < 2000
+    done = frames._measured("amount", amounts_of(1), True)
+    size = {"width": 640, "height": 480, "build_rays": 8, "changes": {"amount": done}}
+    results = [{"case": {"name": "room"}, "result": size | {"pace": {"2": {"GB/s": 18.04}, "1": {"GB/s": 10.0}}}}]
+    text = "\n".join(frames.markdown(results))
+    assert "GB/s* |  | 18 / 10 |" in text and "GFLOP/s* |  |  |" in text

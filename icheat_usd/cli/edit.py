@@ -84,7 +84,7 @@ def _verb(
     if name == "list":
         add_frame(parser)
     elif name in ("add", "set"):
-        key = ", and the payload a key there" if name == "add" else ""
+        key = ", and the payload a key there" if name == "add" else "; a key with masks of its own is 'icheat key set'"
         add_frame(parser, f"let the values be time samples at this time{key}; default: values for all times")
     add_json(parser)
     parser.set_defaults(command=command)

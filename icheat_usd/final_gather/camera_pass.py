@@ -88,9 +88,8 @@ class CameraPass:
             self._edges = edge_pixels(join_looks(*looks), self._snapshot.camera.width)
 
     def sharpen(self, pixels: I64) -> None:
-        """More samples for some pixels beside those with edges, if edges get any."""
-        if self._n_edge:
-            self._edges = np.union1d(self._edges, pixels)
+        """More samples for some pixels beside those with edges."""
+        self._edges = np.union1d(self._edges, pixels)
 
     def all(self) -> Iterator[Band]:
         """All samples, after `first` has been gone through."""

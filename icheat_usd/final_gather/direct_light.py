@@ -22,7 +22,7 @@ from icheat_usd.lighting.specular_rays import add_specular_rays, is_delta
 from icheat_usd.materials import take_points
 from icheat_usd.materials.surface import nonzero_rows
 from icheat_usd.samples import ViewSamples
-from icheat_usd.scene import F32, I64, Bool, SceneSnapshot
+from icheat_usd.scene import F32, I64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer
 
 #: Share of a light's usual rays that every pixel takes first. Fewer miss the tips of penumbrae, and are noisy close to
@@ -47,6 +47,21 @@ class _Part(NamedTuple):
     first: list[int]  #: by light: shadow rays that every sample takes
     whole: list[int]  #: by light: shadow rays of a sample in doubt
     n_specular: int  #: rays of each sample's specular lobe
+
+
+class _Some(NamedTuple):
+    """Some camera samples of a band."""
+
+    points: SurfacePoints
+    to_eye: F32  #: (m, 3)
+    draws: I64  #: (m, 2)
+
+    @classmethod
+    def of(cls, view: ViewSamples, draws: I64, rows: I64) -> _Some:
+        """Ascending rows of a view and its draws, without copies where they are all."""
+        if len(rows) == view.n:
+            return cls(view.points, view.to_eye, draws)
+        return cls(take_points(view.points, rows), np.take(view.to_eye, rows, axis=0), draws[rows])
 
 
 class _First(NamedTuple):
@@ -92,9 +107,10 @@ class DirectLight:
         seen[...] = np.inf, -np.inf
         parts, draws = self._parts(band), draws_of(view, self._settings)
         for part in parts:
+            some = _Some.of(view, draws, part.rows)
             for one in self._lights:
                 extremes = seen[one, part.rows]
-                light[one, part.rows] = self._shadowed(view, part, part.rows, draws, one, False, extremes)
+                light[one, part.rows] = self._shadowed(some, part, one, False, extremes)
                 seen[one, part.rows] = extremes
         first, end = band.pixels
         of_pixels = np.empty((n_lights, end - first, 2), np.float32)
@@ -118,36 +134,25 @@ class DirectLight:
                 n, whole = part.first[one], part.whole[one]
                 if whole > n:
                     rows = part.rows[doubtful[one, place[part.rows]]]
-                    more = self._shadowed(view, part, rows, first.draws, one, True)
+                    more = self._shadowed(_Some.of(view, first.draws, rows), part, one, True)
                     light[one, rows] = light[one, rows] * np.float32(n / whole) + more * np.float32(1 - n / whole)
             found = np.zeros((len(light), len(part.rows), 3), np.float32)
-            points, eye = take_points(view.points, part.rows), np.take(view.to_eye, part.rows, axis=0)
-            draws = first.draws[part.rows] * (1, part.n_specular)
+            some = _Some.of(view, first.draws, part.rows)
             add_specular_rays(
-                self._snapshot, self._tracer, self._sampler, points, eye, draws, self._settings.seed,
-                part.n_specular, part.whole, found,
+                self._snapshot, self._tracer, self._sampler, some.points, some.to_eye,
+                some.draws * (1, part.n_specular), self._settings.seed, part.n_specular, part.whole, found,
             )  # fmt: skip
             light[:, part.rows] += found
         return light
 
-    def _shadowed(
-        self,
-        view: ViewSamples,
-        part: _Part,
-        rows: I64,
-        draws: I64,
-        light: int,
-        is_second: bool,
-        extremes: F32 | None = None,
-    ) -> F32:
+    def _shadowed(self, some: _Some, part: _Part, light: int, is_second: bool, extremes: F32 | None = None) -> F32:
         """Radiance by the first or the second shadow rays of some samples of a part."""
         count = part.whole[light] - part.first[light] if is_second else part.first[light]
-        own = draws[rows] * (1, count) + (0, _SECOND * is_second)
-        found = np.zeros((len(rows), 3), np.float32)
+        own = some.draws * (1, count) + (0, _SECOND * is_second)
+        found = np.zeros((len(own), 3), np.float32)
         add_shadow_rays(
-            self._snapshot, self._tracer, self._sampler, take_points(view.points, rows),
-            np.take(view.to_eye, rows, axis=0), light, own, self._settings.seed, count,
-            (part.whole[light], part.n_specular), found, extremes,
+            self._snapshot, self._tracer, self._sampler, some.points, some.to_eye, light, own, self._settings.seed,
+            count, (part.whole[light], part.n_specular), found, extremes,
         )  # fmt: skip
         return found
 

@@ -238,7 +238,8 @@ def _cached(
     width, height = snapshot.camera.width, snapshot.camera.height
     placed = overture(cache, places, pixels, width, progress)
     records = CacheRecords(placed.pixel, cache.table.reach / placed.extent, placed.spacing)
-    camera.sharpen(light_edges(cache, places, pixels, width, width * height))
+    if settings.edge_samples:
+        camera.sharpen(light_edges(cache, places, pixels, width, width * height))
     # Pixels that records miss are among those with more samples.
     n_samples = settings.samples_per_pixel + settings.edge_samples
     return CachedGather(gatherer, cache, settings.glossy_rays, n_samples, is_kept=is_kept), records

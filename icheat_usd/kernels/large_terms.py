@@ -77,12 +77,18 @@ def _all_pairs(begin, end, number):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _scale_pairs(number, index, scale, coefficients, even, odd, bounds):  # type: ignore[no-untyped-def]
-    """Colours that the quanta multiply, every second one apart; largest size and sum of sizes to `bounds` (2, 4)."""
-    source, targets = address_of(coefficients), (address_of(even), address_of(odd))
+def _scale_pairs(number, index, scale, value, coefficients, even, odd, bounds):  # type: ignore[no-untyped-def]
+    """Colours that the quanta multiply, every second one apart; largest size and sum of sizes to `bounds` (2, 4).
+
+    Meanwhile the quanta come into the cache.
+    """
+    source, targets, quanta = address_of(coefficients), (address_of(even), address_of(odd)), address_of(value)
     largest_even = largest_odd = sum_even = sum_odd = black()
     offset = 0
     for i in range(len(number)):
+        ahead = quanta + QUANTA * np.int64(number[i])
+        fetch(ahead)
+        fetch(ahead + 64)
         k = np.uint64(2 * np.int64(number[i]))
         other = k + np.uint64(1)
         a = scaled(load_color(source + 16 * np.int64(index[k])), scale[k])
@@ -153,7 +159,7 @@ def multiply_tile(count, number, index, scale, value, coefficients, room, out): 
     sums[:] = np.float32(0)
     for first in range(0, count, _AT_ONCE):
         end = min(count, first + _AT_ONCE)
-        _scale_pairs(number[first:end], index, scale, coefficients, even, odd, bounds)
+        _scale_pairs(number[first:end], index, scale, value, coefficients, even, odd, bounds)
         choose_steps(2 * (end - first), bounds, steps, per_step)
         round_pairs(end - first, even, odd, per_step, words)
         _multiply_pairs(first, end, count, number, value, words, steps, sums)

@@ -70,9 +70,9 @@ class _Paths(NamedTuple):
 class _Found(NamedTuple):
     """Ends of camera paths."""
 
+    points: SurfacePoints
     pixel: I32
     throughput: F32
-    points: SurfacePoints
     to_eye: F32
     depth: F32
     stream: I32
@@ -133,27 +133,20 @@ def view_samples(
         some = np.ascontiguousarray(pixels[begin : begin + at_once], np.int64)
         paths, limit = _camera_paths(snapshot, some, samples_per_pixel, first_sample, centred, pixel_filter, seed)
         found += _follow(snapshot, tracer, paths, limit, seed, max_splits, escaped)
-    pixel = np.concatenate([np.empty(0, np.int32), *(part.pixel for part in found)])
-    order = np.argsort(pixel, kind="stable")
-    points = concatenate_points(empty_points(0), *(part.points for part in found))
-
-    def ordered(name: str, width: tuple[int, ...], kind: type[np.generic] = np.float32) -> Any:
-        parts = [np.empty((0, *width), kind), *(getattr(part, name) for part in found)]
-        return np.ascontiguousarray(np.concatenate(parts)[order])
-
+    ends = _by_pixel(found)
     nothing = SkyPaths(np.empty(0, np.int32), np.empty((0, 3), np.float32), np.empty((0, 3), np.float32))
     sky = SkyPaths(*(np.concatenate(columns) for columns in zip(nothing, *escaped, strict=True)))
     return ViewSamples(
         camera.width,
         camera.height,
         samples_per_pixel,
-        pixel[order],
-        ordered("throughput", (3,)),
-        take_points(points, order),
-        ordered("to_eye", (3,)),
-        ordered("depth", ()),
+        ends.pixel,
+        ends.throughput,
+        ends.points,
+        ends.to_eye,
+        ends.depth,
         sky_behind(snapshot, sky, n_pixels),
-        ordered("stream", (), np.int32),
+        ends.stream,
         sky,
     )
 
@@ -283,14 +276,31 @@ def sky_behind(snapshot: SceneSnapshot, paths: SkyPaths, n_pixels: int) -> F32:
     return background
 
 
+def _by_pixel(found: list[_Found]) -> _Found:
+    """All ends of paths, those of a pixel together; nothing is copied where they are in order."""
+    parts = [part for part in found if len(part.pixel)]
+    if not parts:
+        nothing = np.empty((0, 3), np.float32)
+        return _Found(empty_points(0), np.empty(0, np.int32), nothing, nothing, nothing[:, 0], np.empty(0, np.int32))
+    ends = parts[0]
+    if len(parts) > 1:
+        rest: Any = zip(*(part[1:] for part in parts), strict=True)
+        ends = _Found(concatenate_points(*(part.points for part in parts)), *map(np.concatenate, rest))
+    if (np.diff(ends.pixel) < 0).any():
+        order = np.argsort(ends.pixel, kind="stable")
+        columns: Any = [np.take(column, order, axis=0) for column in ends[1:]]
+        ends = _Found(take_points(ends.points, order), *columns)
+    return ends
+
+
 def _end(paths: _Paths, points: SurfacePoints, length: F32, rows: I64, share: F32 | None) -> _Found:
     throughput = paths.throughput[rows]
     if share is not None:
         throughput = throughput * share[rows, None]
     return _Found(
+        points if len(rows) == len(paths.pixel) else take_points(points, rows),
         paths.pixel[rows],
         throughput,
-        take_points(points, rows),
         -paths.direction[rows],
         paths.travelled[rows] + length[rows],
         paths.stream[rows],

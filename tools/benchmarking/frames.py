@@ -26,6 +26,7 @@ from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.scene import LightKind
 from tools.benchmarking.made_up_edits import many_edits, one_edit, ranked_paths
 from tools.benchmarking.meter import Threads, repeat, summary
+from tools.benchmarking.pace import Pace, said
 from tools.benchmarking.parts import AREA_KINDS, Effort, Parts, with_movable_lights
 from tools.benchmarking.play import frames_of, measure_play
 from tools.benchmarking.strokes import Stroke
@@ -131,7 +132,9 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     }
     if not large:
         found["edits"] |= {"64 edits": kinds_of(scene.many), MIXED: kinds_of(scene.mixed)}
+    pace = Pace()
     for name, begin in changes.items():
+        pace.look()
         try:
             with at_most(0.0 if quick else MOST_SECONDS):
                 found["changes"][name] = _measured(name, begin, quick)
@@ -140,7 +143,7 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
             print(f"  {name:<28} broken off after {MOST_SECONDS:.0f} s, and with it the rest of this case", flush=True)
             break
         print(f"  {name:<28} {_cell(found['changes'][name])} frames/s", flush=True)
-    return found
+    return found | {"pace": pace.as_dict()}
 
 
 def _measured(name: str, begin: Callable[[], Callable[[int], Any]], quick: bool) -> dict[str, Any]:
@@ -340,14 +343,17 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
         goals = {GOALS.get((one["width"], one["height"]), {}).get(change) for one in found} - {None}
         cells = [_cell(one["changes"].get(change)) for one in found]
         lines.append(f"| {change} | {', '.join(str(goal) for goal in sorted(goals))} | " + " | ".join(cells) + " |")
+    for unit, what in (("GFLOP/s", "multiply-adds in registers"), ("GB/s", "reading 64 MiB")):
+        cells = [said(one.get("pace"), unit) for one in found]
+        lines.append(f"| *meanwhile: {what}, {unit}* |  | " + " | ".join(cells) + " |")
     rays = {(one["width"], one["height"]): one["build_rays"] for one in found}
-    said = ", ".join(f"{n:,} rays a row at {width} x {height}" for (width, height), n in rays.items())
+    built = ", ".join(f"{n:,} rays a row at {width} x {height}" for (width, height), n in rays.items())
     bits = [change["same_bits"] for one in found for change in one["changes"].values()]
     bits = [same for same in bits if same is not None]
     lines += [
         "",
         *played,
-        f"Frames/s with two threads (quartiles) / one thread; built with {said}.",
+        f"Frames/s with two threads (quartiles) / one thread; built with {built}.",
         "Everything starts at rest but what says so, mixed edits, and domes; what is not at rest in"
         f" {REST_SECONDS:.0f} s is left out.",
         f"Same bits for one thread and two: {'all' if all(bits) else 'NOT all'} of {len(bits)} changes.",
