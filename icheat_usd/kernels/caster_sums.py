@@ -98,6 +98,7 @@ def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: 
             load(by_0 + 2 * plane + q),
             load(by_0 + 3 * plane + q),
         )
+    by[0, 0] = np.float32(0.0)  # keeps it: Numba may free an array after its last mention
 
 
 @kernel

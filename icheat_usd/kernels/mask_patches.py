@@ -110,6 +110,7 @@ def _patches_of(i, begin, resolution, first, widths, texels, size, first_cell, n
                         found = n
                         n += 1
                 patch[first_cell + face * size * size + y * size + x] = found
+    corners[0, 0] = np.float32(0.0)  # keeps it: Numba may free an array after its last mention
     return n
 
 

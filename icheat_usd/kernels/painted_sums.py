@@ -147,6 +147,7 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
                 if product[subset] != np.float32(0.0):
                     to = out_0 + 4 * LANES * ((base + subset) * n_blocks + block)
                     add_ray(to, scaled(light, product[subset]), share, weights_0, ray)
+    weights[0, 0] = np.float32(0.0)  # keeps it: Numba may free an array after its last mention
 
 
 @parallel_kernel
