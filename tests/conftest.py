@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 # What tests compute must not be found by the next run, and must not fill a user's disk.
 os.environ["ICHEAT_CACHE_SIZE"] = "0"
+
+
+@pytest.fixture(autouse=True)
+def sample_stages_stay_as_they_are() -> Iterator[None]:
+    """No test leaves a changed layer of a sample stage behind: USD would serve it to all later ones of the process."""
+    yield
+    if sdf := sys.modules.get("pxr.Sdf"):
+        samples = Path(__file__).parents[1] / "sample_stages"
+        layers = [layer for layer in sdf.Layer.GetLoadedLayers() if layer.dirty and layer.realPath]
+        assert [layer.realPath for layer in layers if samples in Path(layer.realPath).parents] == []
 
 
 @pytest.fixture(scope="session")

@@ -42,6 +42,7 @@ def sample_stage(name: str, variants: dict[str, str], keep: Callable[[SceneSnaps
     from icheat_usd.stage import open_stage, take_snapshot
 
     stage = open_stage(SAMPLE_STAGES / name / "scene.usda")
+    stage.SetEditTarget(stage.GetSessionLayer())  # others in this process may read the same file
     for variant_set, variant in variants.items():
         stage.GetDefaultPrim().GetVariantSet(variant_set).SetVariantSelection(variant)
     snapshot = peer.as_diffuse(take_snapshot(stage, width=24, height=24 if name == "cornell_box" else 20))

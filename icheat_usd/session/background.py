@@ -118,8 +118,11 @@ class Background:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        if self._thread.is_alive() and threading.current_thread() is not self._thread:
-            self._thread.join()
+        if threading.current_thread() is not self._thread:
+            if self._thread.is_alive():
+                self._thread.join()
+            # They hold the session, which holds this: its stage would stay open until garbage is collected.
+            self._next_job, self._on_error = lambda: None, lambda error: None
 
     def _run(self) -> None:
         while not self._closing:

@@ -6,13 +6,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from weakref import WeakMethod
 
 from icheat_usd.edits.model import EMPTY_STACK, EditStack
 from icheat_usd.errors import IcheatError
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.kernels.workers import start_workers
-from icheat_usd.progress import silent
+from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import SceneSnapshot
 from icheat_usd.session import authoring
 from icheat_usd.session.background import Background, Job, Stopped
@@ -328,7 +329,7 @@ class LiveFrames:
                 quality,
                 snapshot=snapshot,
                 engine=session._engine,
-                progress=self._progress,
+                progress=_while_it_lives(self._progress),
                 disk=session._disk,
                 memory=self._shared,
             )
@@ -393,6 +394,17 @@ class LiveFrames:
         self._background.notify()
         for listener in tuple(self._listeners):
             listener(event)
+
+
+def _while_it_lives(progress: Progress) -> Progress:
+    """A method that does not keep its object: frames keep their parts, and parts what they report to."""
+    method = WeakMethod(progress)
+
+    def report(step: str, fraction: float) -> None:
+        if (alive := method()) is not None:
+            alive(step, fraction)
+
+    return report
 
 
 def _keys_of_image(parts: ShotParts) -> tuple[str, ...]:

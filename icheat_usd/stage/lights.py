@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
@@ -130,10 +131,10 @@ def read_light_radiance(prim: Usd.Prim, time: Usd.TimeCode | float | None) -> F6
         The light gives none, such as one without an area.
     """
     reader = _Reader(time_code(time), Placement(1.0, np.zeros(3)), TextureLibrary())
-    rows = reader.kinds[str(prim.GetTypeName())](prim, from_gf(reader.transforms.GetLocalToWorldTransform(prim))[:, :3])
-    if rows is None:
+    light = reader.light(prim)
+    if light is None:
         raise EditError(f"{prim.GetPath()} has no area and gives no light; give it a size")
-    return rows.radiance
+    return light.radiance
 
 
 def with_mesh_lights(
@@ -292,26 +293,22 @@ class _Reader:
         self.textures = textures
         self.inputs = LightInputs(time)
         self.transforms = UsdGeom.XformCache(time)
-        self.kinds: dict[str, Callable[[Usd.Prim, F64], _Light | None]] = {
-            "SphereLight": self._sphere,
-            "DiskLight": self._disk,
-            "RectLight": self._rect,
-            "CylinderLight": self._cylinder,
-            "DistantLight": self._distant,
-            "DomeLight": self._dome,
-            "DomeLight_1": self._dome,
-        }
 
     def read(self, prim: Usd.Prim) -> list[_Light]:
         kind = str(prim.GetTypeName())
         if not self._is_light(prim) or self._is_invisible(prim):
             return []
-        if kind not in self.kinds:
+        if kind not in self._KINDS:
             self._report_kind(prim, kind)
             return []
-        # Stage units; the placement turns it to metres once the sizes that need stage units are known.
-        light = self.kinds[kind](prim, from_gf(self.transforms.GetLocalToWorldTransform(prim))[:, :3])
+        light = self.light(prim)
         return [] if light is None else [light]
+
+    def light(self, prim: Usd.Prim) -> _Light | None:
+        """A light of a kind that is read; None where it gives no light."""
+        # Stage units; the placement turns it to metres once the sizes that need stage units are known.
+        linear = from_gf(self.transforms.GetLocalToWorldTransform(prim))[:, :3]
+        return self._KINDS[str(prim.GetTypeName())](self, prim, linear)
 
     def _is_light(self, prim: Usd.Prim) -> bool:
         return bool(prim) and (
@@ -361,6 +358,17 @@ class _Reader:
         if str(prim.GetTypeName()) == "DomeLight_1" and pole_axis(prim) == "Z":
             light.to_world[:, :3] = light.to_world[:, :3] @ POLE_TURN
         return light
+
+    # Functions, not methods of `self`: those would hold the reader, and by it the stage, until garbage is collected.
+    _KINDS: ClassVar[dict[str, Callable[[_Reader, Usd.Prim, F64], _Light | None]]] = {
+        "SphereLight": _sphere,
+        "DiskLight": _disk,
+        "RectLight": _rect,
+        "CylinderLight": _cylinder,
+        "DistantLight": _distant,
+        "DomeLight": _dome,
+        "DomeLight_1": _dome,
+    }
 
     def _area_light(
         self, prim: Usd.Prim, kind: LightKind, size: tuple[float, float], area: float, texture: int = -1

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
@@ -111,11 +111,6 @@ class MaterialLibrary:
         self.textures = TextureLibrary(self.report)
         self._rows = [_display_color_row()]
         self._row_of: dict[Sdf.Path, int] = {}
-        self._shaders: dict[str, Callable[[UsdShade.Shader, _Row], None]] = {
-            "UsdPreviewSurface": self._read_preview_surface,
-            "ND_UsdPreviewSurface_surfaceshader": self._read_preview_surface,
-            "ND_standard_surface_surfaceshader": self._read_standard_surface,
-        }
 
     @property
     def findings(self) -> list[Finding]:
@@ -195,10 +190,10 @@ class MaterialLibrary:
             if node:
                 found.append(node)
         for shader in found:
-            reader = self._shaders.get(shader.GetShaderId() or "")
-            if reader is not None:
+            read = self._SHADERS.get(shader.GetShaderId() or "")
+            if read is not None:
                 row = _Row(path=path)
-                reader(shader, row)
+                read(self, shader, row)
                 return row
         if found:
             self.report(
@@ -244,6 +239,13 @@ class MaterialLibrary:
         row.ior = self._number(shader, "specular_IOR", 1.5, None, row) if specular > 0.0 else 1.0
         row.opacity = sum(opacity) / 3.0 * (1.0 - transmission)
         self._report_unsupported(shader, _UNSUPPORTED_STANDARD, row)
+
+    # Functions, not methods of `self`: those would hold the library, and by it the stage, until garbage is collected.
+    _SHADERS: ClassVar[dict[str, Callable[[MaterialLibrary, UsdShade.Shader, _Row], None]]] = {
+        "UsdPreviewSurface": _read_preview_surface,
+        "ND_UsdPreviewSurface_surfaceshader": _read_preview_surface,
+        "ND_standard_surface_surfaceshader": _read_standard_surface,
+    }
 
     def _report_unsupported(
         self, shader: UsdShade.Shader, inputs: tuple[tuple[str, tuple[float, ...]], ...], row: _Row
