@@ -236,9 +236,9 @@ def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
     colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray, place: np.ndarray,
     tint: np.ndarray, gloss: np.ndarray, lobes: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
-    row: np.ndarray, out: np.ndarray, through: np.ndarray, first: int, last: int,
+    row: np.ndarray, wanted: np.ndarray, out: np.ndarray, through: np.ndarray, first: int, last: int,
 ) -> None:  # fmt: skip
-    """`light_places` for the runs from `first` up to `last`."""
+    """`light_places` for those runs that are `wanted` from number `first` up to `last`."""
     n, candidates, width = last - first, points.shape[0], points.shape[2]
     n_found, n_room = n * _FOUND * RUN, max(candidates * CANDIDATE, 32)
     storage = np.empty(n_found + 13 * 16 + n_room + 16, np.float32)
@@ -257,7 +257,8 @@ def _light_runs(
     of_turn, groups = hash_combine(seed, turn), width - RUN
     below_one, one = spread(np.float32(1.0 - 2.0**-24)), spread(_ONE)
     n = 0
-    for run in range(first, last):
+    for i in range(first, last):
+        run = np.int64(wanted[i])
         if is_turned_away(bounds[run], light, distant):
             _get_nothing(run, row, out, through, known)
             continue
@@ -324,6 +325,7 @@ def light_places(
     phase: int,
     known: np.ndarray,
     row: np.ndarray,
+    wanted: np.ndarray,
     out: np.ndarray,
     through: np.ndarray,
 ) -> None:
@@ -363,12 +365,14 @@ def light_places(
         What each place has found between it and its point; none: nobody wants to know.
     row : (n,) int32
         Row of `out` that each place has, all different.
+    wanted : (n_wanted,) int32
+        Runs that are meant; what the places of others have stays.
     out : (n, 3) float32, set
     through : (n,) int32, set
         1 + point of the light where only see-through surfaces are in the way, and `out` is what the place would get
         without them; else 0. None: there are no such surfaces.
     """
-    n_runs = len(place)
+    n_runs = len(wanted)
     n_tasks = (n_runs + _RUNS - 1) // _RUNS
     half = (n_tasks + 1) // 2
     for i in prange(n_tasks):
@@ -377,6 +381,6 @@ def light_places(
         task = 2 * turn_of if turn_of < half else 2 * (turn_of - half) + 1
         _light_runs(
             function, arguments, opaque, passing, points, first_point, colors, light, distant, seed, turn, bounds,
-            place, tint, gloss, lobes, share_rays, phase, known, row, out, through, task * _RUNS,
+            place, tint, gloss, lobes, share_rays, phase, known, row, wanted, out, through, task * _RUNS,
             min(n_runs, (task + 1) * _RUNS),
         )  # fmt: skip

@@ -105,6 +105,11 @@ class LastLook:
         self.known = np.full(places.n, -1, np.int16)
         self.n = 0  #: looks so far
 
+    def forget(self, runs: I64) -> None:
+        """Nothing is known of the places of some runs any more."""
+        for run in runs:
+            self.known[run * RUN : (run + 1) * RUN] = -1
+
 
 def prepare_places(
     snapshot: SceneSnapshot, points: SurfacePoints, albedo: F32, to_eye: F32 | None, order: I64 | None = None
@@ -172,6 +177,7 @@ def direct_at(
     turn: int = 0,
     last: LastLook | None = None,
     shining: tuple[F32, bool] | None = None,
+    runs: I32 | None = None,
 ) -> None:
     """Light of a one-light snapshot that places reflect, one shadow ray each, into `out` (n, 3) in the points' order.
 
@@ -187,6 +193,8 @@ def direct_at(
         Of the same light and turn somewhere near: most places take their shadow from it. It is brought up to date.
     shining : (table, distant), optional
         What `light_points` has for the snapshot and the seed, if that is known.
+    runs : (n_runs,), optional
+        Runs of places that are meant, by default all; what others have in `out` means nothing then.
     """
     controls = snapshot.controls(0)
     tint, gloss = places.tint, places.gloss
@@ -197,10 +205,10 @@ def direct_at(
         gloss[:, :_ALPHA] *= np.float32(controls.specular)
     table, distant = shining or light_points(snapshot, seed)
     groups = light_groups(table, _FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
-    through = np.empty(0 if shadows.passing is None else places.n, np.int32)
+    through = np.zeros(0 if shadows.passing is None else places.n, np.int32)
     function, opaque = shadows.opaque.address_of("rtcOccluded16")
     passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
-    phase, known = -1, np.empty(0 if controls.shaping is None else places.n, np.int16)
+    phase, known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
     if last is not None:
         known = last.known
         phase = last.n % PART if last.n else -1
@@ -226,6 +234,7 @@ def direct_at(
         phase,
         known,
         places.row,
+        np.arange(len(places.place), dtype=np.int32) if runs is None else runs,
         out,
         through,
     )

@@ -24,6 +24,7 @@ from icheat_usd.lighting.points import has_points, light_points
 from icheat_usd.lighting.quick import LastLook, Places, Shadows, build_shadows, direct_at, prepare_places
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
+from icheat_usd.relight.closer_look import CloserLook
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -41,7 +42,7 @@ _RAYS_PER_STEP = 1 << 16  # of the general way
 _PARTS = 4  # bounces of a light that moves are found for one of so many cells at a time
 
 # Rays to the sky of each patch point and view sample, for domes on the move.
-_SKY_OF_CELLS, _SKY_OF_VIEW = 2, 8
+_SKY_OF_CELLS, _SKY_OF_VIEW = 16, 8
 
 # The same where the view is sparse, of few cells and few samples.
 _SKY_OF_FEW_CELLS, _SKY_OF_FEW = 6, 48
@@ -233,6 +234,7 @@ class Following:
         self.n = 0  #: first looks so far
         self.cells = None if around.cells is None else LastLook(around.cells)
         self.view = None if around.tiles is None else LastLook(around.tiles)
+        self.patches = None if around.patches is None else CloserLook(around.patches, around.gather)
 
     def next_part(self) -> tuple[int, int]:
         """Of the cells, whose bounces are looked at this time; all of them at first."""
@@ -255,16 +257,17 @@ class MovingLight:
         self._cells = self._view = np.empty((0, 3), np.float32)  # from the first step on
 
     def show(self, radiance: F32, view_direct: F32) -> None:
-        """First look: a shadow ray per cell, and where neighbours disagree one per view sample.
+        """First look: a shadow ray per cell, more where that leaves noise, and one per view sample at shadows' edges.
 
         Near the look before, a part of these rays is enough.
         """
         around = self._around
         self.following = last = self.following or Following(around)
-        assert around.cells is not None and around.tiles is not None
+        assert around.cells is not None and around.tiles is not None and last.patches is not None
         direct = np.empty((around.gather.n, 3), np.float32)
         shadows = around.shadows_of(self._alone)
         direct_at(self._alone, shadows, around.cells, self._seed, False, direct, 0, last.cells, self._shining)
+        last.patches.improve(self._alone, shadows, self._seed, self._shining, direct)
         around.bounce(direct, radiance, self.direct, last.next_part())
         self.direct = direct
         direct_at(self._alone, shadows, around.tiles, self._seed, True, view_direct, 0, last.view, self._shining)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.kernels.shadow import is_turned_away
+from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
 from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
 from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
@@ -144,6 +145,28 @@ def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
     assert (fresh.sum(axis=1) == 0).mean() > 0.01
     assert old[0] == 0.0 and max(old) < 0.02
     np.testing.assert_array_equal(found, fresh)
+
+
+@pytest.mark.parametrize("name", ["rect", "sun"])
+def test_some_runs_of_places_get_what_all_would(name: str) -> None:
+    """To the bit, through holes and glass as well; what is kept of others stays."""
+    snapshot = scene(LIGHTS[name], Material(0.5))
+    points = on_floor(snapshot, 1000)
+    shadows = build_shadows(snapshot, tracer_of(snapshot))
+    places = prepare_places(snapshot, points, points.albedo, None)
+    found, every = np.full((2, 1000, 3), -1, np.float32)
+    last, of_all = LastLook(places), LastLook(places)
+    runs = np.array([1, 4, 15], np.int32)
+    direct_at(snapshot, shadows, places, 5, False, found, last=last, runs=runs)
+    direct_at(snapshot, shadows, places, 5, False, every, last=of_all)
+    meant = np.isin(np.arange(1000) // RUN, runs)
+    np.testing.assert_array_equal(found[meant], every[meant])
+    np.testing.assert_array_equal(last.known[meant], of_all.known[meant])
+    assert (last.known[~meant] == -1).all() and (found[~meant] == -1).all()
+    last.forget(np.array([4]))
+    assert (last.known[4 * RUN : 5 * RUN] == -1).all() and (
+        last.known[RUN : 2 * RUN] == of_all.known[RUN : 2 * RUN]
+    ).all()
 
 
 def test_light_crosses_layers_as_it_does_for_all_shadow_rays() -> None:

@@ -1,0 +1,98 @@
+"""A closer look at the gather cells whose light a single shadow ray gets wrong, while a light moves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icheat_usd.kernels.closer_look import noise_of_runs, take_closer_looks
+from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.lighting.quick import LastLook, Places, Shadows, direct_at
+from icheat_usd.samples import GatherSamples
+from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot
+
+#: Runs of patch points that are looked at in a frame, and with them their neighbours: some 40,000 points.
+MOST_RUNS = 384
+#: Of these, the noisiest, such as those next to a small light, are looked at so many times.
+WORST_RUNS, TURNS = 16, 4
+#: Less noise in all, beside all light of the cells, is not worth a look.
+LITTLE_NOISE = 5e-4
+
+
+class CloserLook:
+    """Looks at all patch points of runs of cells, of those between which the light differs most."""
+
+    def __init__(self, patches: Places, gather: GatherSamples) -> None:
+        first = np.arange(0, patches.n, RUN)
+        last = np.minimum(first + RUN, patches.n) - 1
+        self._patches, self._gather = patches, gather
+        self._begin, self._end = (  # cells of each run
+            np.searchsorted(gather.cell_begin, first, side="right").astype(np.int64) - 1,
+            np.searchsorted(gather.cell_begin, last, side="right").astype(np.int64),
+        )
+        self._last = LastLook(patches)
+        self._looked_at = np.zeros(len(first), np.uint8)
+        self._found: F32 = np.empty((patches.n, 3), np.float32)
+
+    def improve(
+        self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: tuple[F32, bool], direct: F32
+    ) -> None:
+        """Make the light of noisy cells that of their patch points.
+
+        Parameters
+        ----------
+        alone, shadows, seed, shining
+            As `direct_at` has them.
+        direct : (n_cells, 3), changed
+            From one look at each cell.
+        """
+        light, runs = self._noisy_runs(direct)
+        before, self._looked_at = self._looked_at, np.zeros_like(self._looked_at)
+        self._looked_at[runs] = 1
+        # What was not looked at in the frame before may be far from what it was.
+        self._last.forget(np.flatnonzero(self._looked_at > before))
+        direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs)
+        self._take(runs, direct)
+        worst = self._worst_runs(direct, light, runs)
+        if len(worst):
+            places = (worst[:, None] * RUN + np.arange(RUN)).ravel()
+            places = places[places < self._patches.n]
+            total, more = self._found[places], np.empty_like(self._found)
+            for turn in range(1, TURNS):
+                direct_at(alone, shadows, self._patches, seed, False, more, turn, None, shining, worst)
+                total += more[places]
+            self._found[places] = total / np.float32(TURNS)
+            self._take(worst, direct)
+
+    def _noise(self, direct: F32) -> tuple[F64, float]:
+        """Squared noise of each run, and the light of all."""
+        found = np.empty((2, len(self._begin)))
+        noise_of_runs(direct, self._gather.area, self._begin, self._end, found)
+        return found[0], float(found[1].sum())
+
+    def _noisy_runs(self, direct: F32) -> tuple[float, I32]:
+        """Light of all cells, and runs that are worth a look, ascending."""
+        noise, light = self._noise(direct)
+        most = _largest(noise, MOST_RUNS)
+        left = noise.sum() - np.cumsum(noise[most])
+        most = most[: 1 + np.searchsorted(-left, -((LITTLE_NOISE * light) ** 2))]
+        # Beside what is seen to differ lies what one look has missed, such as the border of a patch of sun.
+        wanted = np.zeros(len(noise) + 2, np.bool_)
+        for beside in range(3):
+            wanted[most + beside] = True
+        return light, np.flatnonzero(wanted[1:-1]).astype(np.int32)
+
+    def _worst_runs(self, direct: F32, light: float, runs: I32) -> I32:
+        """Those of some runs that are still noisy, ascending; none if that does not matter."""
+        noise = self._noise(direct)[0][runs]
+        worst = np.sort(runs[_largest(noise, WORST_RUNS)])
+        return worst if noise.sum() > (LITTLE_NOISE * light) ** 2 else worst[:0]
+
+    def _take(self, runs: I32, direct: F32) -> None:
+        cells = self._begin, self._end, self._gather.cell_begin
+        take_closer_looks(runs, *cells, RUN, self._looked_at, self._found, direct)
+
+
+def _largest(values: F64, n: int) -> I64:
+    """Numbers of the `n` largest values, largest first."""
+    most = np.argpartition(-values, n)[:n] if len(values) > n else np.arange(len(values))
+    return most[np.argsort(-values[most], kind="stable")]

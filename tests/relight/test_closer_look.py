@@ -1,0 +1,105 @@
+"""Closer looks at gather cells against plain loops, and against the light that they stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icheat_usd.kernels.closer_look import noise_of_runs, take_closer_looks
+from icheat_usd.relight import closer_look
+from icheat_usd.relight.closer_look import CloserLook
+from icheat_usd.relight.lights import LiveLights
+from icheat_usd.scene import F32, LightKind, SceneSnapshot
+from tests.pipeline import Pipeline
+from tests.scenes import Light, cornell_meshes, look_at, make_snapshot, rotation, translation
+
+#: Just above the floor, so that light falls off within a cell; and a beam that lights a part of the floor.
+NEAR = Light(LightKind.SPHERE, (9, 9, 9), translation(0.3, -0.9, 0.2)[:3], (0.02, 0.0), path="/near")
+GRAZING = Light(
+    LightKind.RECT, (5, 5, 5), (translation(-0.2, -0.9, 0.0) @ rotation((0, 1, 0), 90))[:3], (0.6, 0.1), path="/grazing"
+)
+SUN = Light(LightKind.DISTANT, (3, 3, 3), rotation((0, 1, 0), 35)[:3], (0.2, 0.0), path="/sun")
+
+
+def room(light: Light) -> SceneSnapshot:
+    return make_snapshot(cornell_meshes(), lights=[light], camera=look_at((0, 0, 3.9), fov=39.3, width=16, height=12))
+
+
+def first_look(pipeline: Pipeline, seed: int) -> LiveLights:
+    return LiveLights(
+        pipeline.snapshot, pipeline.tracer, pipeline.view, pipeline.gather, pipeline.bounces, n_bounces=4,
+        light_samples=16, seed=seed,
+    )  # fmt: skip
+
+
+def error(found: F32, expected: F32, area: F32) -> float:
+    weight = area[:, None].astype(np.float64)
+    return float(np.sqrt((((found - expected) * weight) ** 2).sum() / ((expected * weight) ** 2).sum()))
+
+
+@pytest.mark.parametrize("light", [NEAR, GRAZING, SUN], ids=lambda light: light.path[1:])
+def test_a_first_look_has_less_than_half_of_the_noise(light: Light, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = Pipeline(room(light), n_gather=2048)
+    closer, plain = [], []
+    for seed in range(4):
+        lights = first_look(pipeline, seed)
+        found = lights.radiance[0].copy()
+        with monkeypatch.context() as patch:
+            patch.setattr(CloserLook, "improve", lambda *_: None)
+            unimproved = first_look(pipeline, seed).radiance[0].copy()
+        while lights.refine():
+            pass
+        closer.append(error(found, lights.radiance[0], pipeline.gather.area))
+        plain.append(error(unimproved, lights.radiance[0], pipeline.gather.area))
+    assert np.mean(plain) > 0.02
+    assert np.mean(closer) < 0.5 * np.mean(plain)
+
+
+def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where cells beside each other get the same light, no ray is sent."""
+    pipeline = Pipeline(room(SUN), n_gather=512)
+    lights = first_look(pipeline, 0)
+    assert lights._around.patches is not None
+    look = CloserLook(lights._around.patches, pipeline.gather)
+    even = np.ones((pipeline.gather.n, 3), np.float32)
+    assert len(look._noisy_runs(even)[1]) <= 2  # one, and what lies beside it
+    assert len(look._worst_runs(even, 1.0, np.arange(4, dtype=np.int32))) == 0
+    monkeypatch.setattr(closer_look, "MOST_RUNS", 2)
+    spotted = even.copy()
+    spotted[::50] = 9.0
+    assert 2 < len(look._noisy_runs(spotted)[1]) <= 6
+
+
+def test_noise_of_runs_is_that_of_a_plain_loop() -> None:
+    rng = np.random.default_rng(1)
+    direct, area = rng.random((50, 3)).astype(np.float32), rng.random(50).astype(np.float32)
+    begin, end = np.array([0, 6, 20, 50]), np.array([7, 20, 50, 50])
+    found = np.empty((2, 4))
+    noise_of_runs(direct, area, begin, end, found)
+    for run in range(4):
+        level, size = direct[begin[run] : end[run]].sum(axis=1, dtype=np.float64), area[begin[run] : end[run]]
+        mean = (level * size).sum() / size.sum() if len(size) else 0.0
+        np.testing.assert_allclose(found[0, run], ((size * (level - mean)) ** 2).sum(), rtol=1e-5)
+        np.testing.assert_allclose(found[1, run], (size * level).sum(), rtol=1e-5)
+
+
+def test_cells_get_the_mean_of_what_was_looked_at() -> None:
+    """Cells of runs that were looked at, of a cell between two runs the part that was; all others stay."""
+    rng = np.random.default_rng(2)
+    count = rng.integers(1, 9, 40)
+    cell_begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    n, per_run = int(cell_begin[-1]), 16
+    of_patches = rng.random((n, 3)).astype(np.float32)
+    first = np.arange(0, n, per_run)
+    begin = np.searchsorted(cell_begin, first, side="right") - 1
+    end = np.searchsorted(cell_begin, np.minimum(first + per_run, n) - 1, side="right")
+    runs = np.array([1, 2, 5], np.int32)
+    looked_at = np.zeros(len(first), np.uint8)
+    looked_at[runs] = 1
+    direct = np.full((40, 3), -1, np.float32)
+    take_closer_looks(runs, begin, end, cell_begin, per_run, looked_at, of_patches, direct)
+    for cell in range(40):
+        mine = np.arange(cell_begin[cell], cell_begin[cell + 1])
+        mine = mine[looked_at[mine // per_run] > 0]
+        expected = of_patches[mine].mean(axis=0) if len(mine) else np.full(3, -1.0)
+        np.testing.assert_allclose(direct[cell], expected, rtol=1e-6)
