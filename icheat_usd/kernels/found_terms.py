@@ -170,11 +170,13 @@ def multiply_found(  # type: ignore[no-untyped-def]
     for turn in prange(PARTS):
         part = 2 * turn % PARTS + 2 * turn // PARTS
         first, last = share(cost_end, part), share(cost_end, part + 1)
-        room = new_room()
+        room, none = new_room(), found[:0]
         if first < last:
             next_count = _prepare(found[found_begin[first] : found_begin[first + 1]], value)
         for job in range(first, last):
             numbers, count = found[found_begin[job] : found_begin[job + 1]], next_count
             if job + 1 < last:
                 next_count = _prepare(found[found_begin[job + 1] : found_begin[job + 2]], value)
-            multiply_tile(count, numbers, index, scale, value, coefficients[job_version[job]], room, out[job_out[job]])
+            multiply_tile(
+                numbers[:count], none, index, scale, value, coefficients[job_version[job]], room, out[job_out[job]]
+            )

@@ -34,7 +34,7 @@ from icheat_usd.kernels.simd import (
     widen,
 )
 
-_AT_ONCE = 256  # pairs of coefficients: their quanta stay in the second-level cache until they are multiplied
+_AT_ONCE = 128  # pairs of coefficients: their quanta are in the second-level cache before they are multiplied
 QUANTA = 2 * LANES  #: bytes of a pair of coefficients
 
 
@@ -108,14 +108,14 @@ def _add(place, sums, step):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _multiply_pairs(first, end, count, number, value, words, steps, sums):  # type: ignore[no-untyped-def]
-    """Add pairs ``first:end`` times words to `sums` (12, 16); what is multiplied next comes into the cache."""
+def _multiply_pairs(number, value, words, steps, ahead, sums):  # type: ignore[no-untyped-def]
+    """Add pairs times words to `sums` (12, 16); meanwhile pairs `ahead` come into the cache, of which there is one."""
     r0 = r1 = r2 = r3 = g0 = g1 = g2 = g3 = b0 = b1 = b2 = b3 = no_sum()
-    base, place, last = address_of(value), address_of(words), np.uint64(count - 1)
-    for i in range(np.uint64(first), np.uint64(end)):
-        ahead = base + QUANTA * np.int64(number[min(i + np.uint64(_AT_ONCE), last)])
-        fetch(ahead)
-        fetch(ahead + 64)
+    base, place, last = address_of(value), address_of(words), np.uint64(len(ahead) - 1)
+    for i in range(np.uint64(len(number))):
+        soon = base + QUANTA * np.int64(ahead[min(i, last)])
+        fetch(soon)
+        fetch(soon + 64)
         quanta = base + QUANTA * np.int64(number[i])
         r, g, b = spread_pair(place), spread_pair(place + 4), spread_pair(place + 8)
         x = widen(quanta)
@@ -150,42 +150,59 @@ def new_room():  # type: ignore[no-untyped-def]
 
 
 @kernel
-def multiply_tile(count, number, index, scale, value, coefficients, room, out):  # type: ignore[no-untyped-def]
-    """Some pairs of coefficients of one tile times one version; `room` is from `new_room`."""
+def multiply_tile(number, following, index, scale, value, coefficients, room, out):  # type: ignore[no-untyped-def]
+    """Some pairs of coefficients of one tile times one version; `room` is from `new_room`.
+
+    Pairs of the `following` product come into the cache meanwhile.
+    """
     n = _AT_ONCE + 4  # `round_pairs` works in whole vectors
     even, odd, words = room[:n], room[n : 2 * n], room[2 * n : 3 * n]
     bounds, steps, per_step = room[3 * n : 3 * n + 2], room[3 * n + 2], room[3 * n + 3 : 3 * n + 7].reshape(16)
     sums = room[3 * n + 7 : 3 * n + 55]
     sums[:] = np.float32(0)
-    for first in range(0, count, _AT_ONCE):
-        end = min(count, first + _AT_ONCE)
-        _scale_pairs(number[first:end], index, scale, value, coefficients, even, odd, bounds)
-        choose_steps(2 * (end - first), bounds, steps, per_step)
-        round_pairs(end - first, even, odd, per_step, words)
-        _multiply_pairs(first, end, count, number, value, words, steps, sums)
+    for first in range(0, len(number), _AT_ONCE):
+        some, ahead = number[first : first + _AT_ONCE], number[first + _AT_ONCE : first + 2 * _AT_ONCE]
+        if len(ahead) == 0:
+            ahead = following if len(following) > 0 else some
+        _scale_pairs(some, index, scale, value, coefficients, even, odd, bounds)
+        choose_steps(2 * len(some), bounds, steps, per_step)
+        round_pairs(len(some), even, odd, per_step, words)
+        _multiply_pairs(some, value, words, steps, ahead, sums)
     place, target = address_of(sums), address_of(out)
     for k in range(4):
         store_colors(target + 256 * k, load(place + 64 * k), load(place + 256 + 64 * k), load(place + 512 + 64 * k))
 
 
 @kernel
+def _find_pairs(begin, end, index, worth, size, least, version, number):  # type: ignore[no-untyped-def]
+    """Those of a tile's pairs that are multiplied with a version, put into `number`."""
+    if len(least) > 0:
+        return number[: _find_large_pairs(begin, end, index, worth, size[version], least[version], number)]
+    return number[: _all_pairs(begin, end, number)]
+
+
+@kernel
 def _multiply_run(  # type: ignore[no-untyped-def]
     tile_begin, index, scale, worth, value, coefficients, size, least, job_tile, job_version, job_out, first, last, out
 ):
-    """Jobs `first` to `last`."""
+    """Jobs `first` to `last`; the pairs of each are found before the one before it is multiplied."""
     most = 0
     for job in range(first, last):
         most = max(most, tile_begin[job_tile[job] + 1] - tile_begin[job_tile[job]])
-    number = np.empty(most + 18, np.int32)
-    room = new_room()
-    for job in range(first, last):
-        version = job_version[job]
-        begin, end = tile_begin[job_tile[job]], tile_begin[job_tile[job] + 1]
-        if len(least) > 0:
-            count = _find_large_pairs(begin, end, index, worth, size[version], least[version], number)
+    rooms, room = np.empty((2, most + 18), np.int32), new_room()
+    following = rooms[1, :0]
+    for job in range(first, last + 1):
+        number = following
+        if job < last:
+            begin, end = tile_begin[job_tile[job]], tile_begin[job_tile[job] + 1]
+            following = _find_pairs(begin, end, index, worth, size, least, job_version[job], rooms[job % 2])
         else:
-            count = _all_pairs(begin, end, number)
-        multiply_tile(count, number, index, scale, value, coefficients[version], room, out[job_out[job]])
+            following = rooms[0, :0]
+        if job > first:
+            made = job - 1
+            multiply_tile(
+                number, following, index, scale, value, coefficients[job_version[made]], room, out[job_out[made]]
+            )
 
 
 @parallel_kernel
