@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import lobe_rays as kernels
-from icheat_usd.kernels.gather_rows import DETOUR
+from icheat_usd.kernels.packets import DETOUR
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.tracing import point_magnitudes
 from icheat_usd.materials import empty_points, shade_hits, take_points

@@ -8,6 +8,7 @@ import numpy as np
 
 from icheat_usd.final_gather.near_hits import NearLight
 from icheat_usd.kernels import record_rays as kernels
+from icheat_usd.kernels.packets import DETOUR
 from icheat_usd.materials import concatenate_points, empty_points, shade_hits, take_points
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, I32, I64, Hits, SceneSnapshot, SurfacePoints
@@ -197,7 +198,7 @@ class HemisphereTracer:
             rays.triangle,
             rays.uv,
         )
-        return self._behind(rays, np.flatnonzero(rays.cell.reshape(-1) == kernels.DETOUR))
+        return self._behind(rays, np.flatnonzero(rays.cell.reshape(-1) == DETOUR))
 
     def _behind(self, rays: RecordRays, detour: I64) -> RecordRays:
         """Follow rays over surfaces that do not simply reflect."""

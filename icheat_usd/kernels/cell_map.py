@@ -109,18 +109,25 @@ def unit_normal(plane, side):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def square_at(face, f, u, v):  # type: ignore[no-untyped-def]
+    """Number of the square of a place on side `f` of the placed triangles; -1 for a side that is not divided."""
+    along_u, along_v = np.int64(face[f, 1]), np.int64(face[f, 2])
+    if along_u == 0:
+        return np.int64(-1)
+    a = min(max(np.int64(u * np.float32(along_u)), 0), along_u - 1)
+    b = min(max(np.int64(v * np.float32(along_v)), 0), along_v - 1)
+    block = (b >> 2) * ((along_u + 3) >> 2) + (a >> 2)  # a block of 4 by 4 entries is a line of the cache
+    return np.int64(face[f, 0]) + (block << 4) + ((b & 3) << 2) + (a & 3)
+
+
+@kernel
 def entry_at(place, face, square, i, t, side, u, v):  # type: ignore[no-untyped-def]
     """Entry of a place on a triangle."""
     if place[i] == NO_FACES:
         return np.int64(WALK)
     f = 2 * (place[i] + t) + side
-    along_u, along_v = np.int64(face[f, 1]), np.int64(face[f, 2])
-    if along_u == 0:
-        return np.int64(face[f, 0])
-    a = min(max(np.int64(u * np.float32(along_u)), 0), along_u - 1)
-    b = min(max(np.int64(v * np.float32(along_v)), 0), along_v - 1)
-    block = (b >> 2) * ((along_u + 3) >> 2) + (a >> 2)  # a block of 4 by 4 entries is a line of the cache
-    return np.int64(square[np.int64(face[f, 0]) + (block << 4) + ((b & 3) << 2) + (a & 3)])
+    at = square_at(face, f, u, v)
+    return np.int64(face[f, 0]) if at < 0 else np.int64(square[at])
 
 
 @kernel

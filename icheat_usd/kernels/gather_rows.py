@@ -7,28 +7,23 @@ from typing import Any, cast
 import numpy as np
 from llvmlite import ir
 from numba import get_num_threads, prange, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.cell_map import (
-    WALK,
-    entry_at,
-    nearest_listed,
-    place_on,
-    plane_of,
-    side_seen,
-    unit_normal,
+from icheat_usd.kernels.packets import (
+    CELL,
+    DETOUR,
+    NOTHING,
+    clear_packet,
+    look_up_cells,
+    make_look_up,
+    make_packet,
+    trace_16,
 )
-from icheat_usd.kernels.embree import call_1, call_packet
-from icheat_usd.kernels.locate import nearest_sample
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 from icheat_usd.kernels.samples import basis, cosine_direction, cosine_lobe
 
 BATCH = 4096  # rays that are put in order of direction; their buffers fit the second-level cache
-NOTHING = -1  # key of a ray that ends nowhere: below its surface, or on a degenerate triangle
-DETOUR = -2  # key of a ray that ended on a triangle that does not simply reflect
-_INVALID = np.uint32(0xFFFFFFFF)
 _BINS = 16  # along each axis, of directions in the order of tracing
 
 
@@ -45,25 +40,6 @@ def _trailing_zeros(typingctx: Any, word: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return types.uint64(types.uint64), codegen
-
-
-@cast(Any, intrinsic)  # as a caller sees it: without the typing context
-def _fetch(typingctx: Any, column: Any, row: Any) -> Any:
-    """Begin to load row `row` of a C-contiguous array, which is not waited for."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, args[0])
-        stride = builder.extract_value(array.strides, 0)
-        pointer = ir.IntType(8).as_pointer()
-        base = builder.ptrtoint(array.data, stride.type)
-        address = builder.inttoptr(builder.add(base, builder.mul(stride, args[1])), pointer)
-        number = ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
-        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        builder.call(callee, [address, ir.Constant(number, 0), ir.Constant(number, 3), ir.Constant(number, 1)])
-        return context.get_dummy_value()
-
-    return types.void(column, types.int64), codegen
 
 
 @kernel
@@ -144,50 +120,6 @@ def _order_by_direction(n, x, y, z, bin_of, bin_begin, order):  # type: ignore[n
     return bin_begin[_BINS * _BINS - 1]
 
 
-@kernel
-def make_packet():  # type: ignore[no-untyped-def]
-    """Room for 16 rays as `trace_16` wants them: which count, their floats, the same as words, and those of one ray."""
-    storage = np.zeros(24 * 16 + 16 + 64, np.float32)
-    shift = np.int64((-storage.ctypes.data % 64) // 4)
-    valid = storage[shift : shift + 16].view(np.int32)
-    rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
-    single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
-    return valid, rays, rays.view(np.uint32), single, single.view(np.uint32)
-
-
-@kernel
-def clear_packet(rays, words):  # type: ignore[no-untyped-def]
-    """Rays without end that have met nothing; origins and directions stay."""
-    rays[3, :] = 0.0
-    rays[7, :] = 0.0
-    rays[8, :] = np.inf
-    words[9, :] = _INVALID
-    words[10, :] = 0
-    words[11, :] = 0
-    words[17:21, :] = _INVALID
-
-
-@kernel
-def trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at):  # type: ignore[no-untyped-def]
-    """Nearest hits of a packet, one by one where packets are slower."""
-    if trace.packets:
-        call_packet(trace.function, valid_at, trace.scene, rays_at, trace.arguments)
-        return
-    for k in range(16):
-        if valid[k] == 0:
-            continue
-        for c in range(12):
-            single[c] = rays[c, k]
-        for c in range(17, 21):
-            single_words[c] = _INVALID
-        call_1(trace.function, trace.scene, single_at)
-        rays[8, k] = single[8]
-        for c in range(15, 17):
-            rays[c, k] = single[c]
-        for c in range(17, 21):
-            words[c, k] = single_words[c]
-
-
 @parallel_kernel
 def count_hits(  # type: ignore[no-untyped-def]
     trace,
@@ -253,11 +185,9 @@ def count_hits(  # type: ignore[no-untyped-def]
         origin, order = np.empty(BATCH, np.int64), np.empty(BATCH, np.int64)
         bin_of, bin_begin = np.empty(BATCH, np.int32), np.empty(_BINS * _BINS + 2, np.int64)
         key = np.empty(BATCH, np.int32)
-        entries, listed = np.empty(16, np.int64), np.empty(16, np.int64)
-        instances, triangles = np.empty(16, np.int64), np.empty(16, np.int64)
-        sides, at = np.empty(16, np.int64), np.empty((16, 6), np.float32)
         stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
         valid, rays, words, single, single_words = make_packet()
+        ends, at = make_look_up()
         rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
 
         for block in range(lane, (n_rows + together - 1) // together, n_lanes):
@@ -299,53 +229,12 @@ def count_hits(  # type: ignore[no-untyped-def]
                         rays[6, k] = z[e]
                     clear_packet(rays, words)
                     trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
-                    # In steps over the packet, so that the loads of one ray do not wait for those of another.
+                    look_up_cells(
+                        valid, rays, words, mesh_begin, instance_mesh, place, face, square, candidates, sample, slot,
+                        slot_detour, locator, points, to_world, to_object, triangle_route, stack, bound, ends, at,
+                    )  # fmt: skip
                     for k in range(width):
-                        if words[18, k] != _INVALID:
-                            i = np.int64(words[18, k] if words[19, k] == _INVALID else words[19, k])
-                            t = mesh_begin[instance_mesh[i]] + np.int64(words[17, k])
-                            instances[k], triangles[k] = i, t
-                            _fetch(points, t)
-                            _fetch(triangle_route, t)
-                            _fetch(face, max(0, 2 * (place[i] + t)))
-                    for k in range(width):
-                        e = order[first + k]
-                        entries[k] = NOTHING
-                        listed[k] = 0
-                        if words[18, k] == _INVALID:
-                            continue
-                        i, t = instances[k], triangles[k]
-                        if triangle_route[t] != 0:
-                            entries[k] = DETOUR
-                            continue
-                        plane = plane_of(points, to_object, i, t)
-                        if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
-                            continue
-                        side = side_seen(plane, x[e], y[e], z[e])
-                        entries[k] = entry_at(place, face, square, i, t, side, rays[15, k], rays[16, k])
-                        if entries[k] < 0:
-                            listed[k] = 1
-                            sides[k] = side
-                            if entries[k] != WALK:
-                                _fetch(candidates, -1 - entries[k])
-                            at[k, 0], at[k, 1], at[k, 2] = place_on(points, to_world, i, t, rays[15, k], rays[16, k])
-                            at[k, 3], at[k, 4], at[k, 5] = unit_normal(plane, side)
-                    for k in range(width):
-                        if listed[k] == 1 and entries[k] != WALK:
-                            begin = -entries[k]
-                            for a in range(begin, begin + min(candidates[begin - 1], 4)):
-                                _fetch(sample, candidates[a])
-                    for k in range(width):
-                        found = entries[k]
-                        if listed[k] == 1:
-                            i, side = instances[k], sides[k]
-                            px, py, pz, nx, ny, nz = at[k, 0], at[k, 1], at[k, 2], at[k, 3], at[k, 4], at[k, 5]
-                            if found == WALK:
-                                found = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
-                            else:
-                                detour_2 = slot_detour[slot[2 * i + side]]
-                                found = nearest_listed(candidates, sample, found, detour_2, px, py, pz, nx, ny, nz)
-                        key[order[first + k]] = found
+                        key[order[first + k]] = ends[CELL, k]
                 done += m
                 for r in range(row_0, row_1):
                     for k in range(m):

@@ -7,13 +7,20 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.bsdf import sample_lobe
-from icheat_usd.kernels.gather_rows import NOTHING, clear_packet, make_packet, trace_16
+from icheat_usd.kernels.packets import (
+    CELL,
+    INSTANCE,
+    TRIANGLE,
+    clear_packet,
+    look_up_cells,
+    make_look_up,
+    make_packet,
+    trace_16,
+)
 from icheat_usd.kernels.random import hash_combine, sobol_pair
-from icheat_usd.kernels.record_rays import cell_of_hit
 from icheat_usd.kernels.tracing import offset_origin
 from icheat_usd.kernels.vector import normalized, row3, store3
 
-_INVALID = np.uint32(0xFFFFFFFF)
 _RAYS_AT_ONCE = 1024  # that a thread takes: a multiple of a packet's 16
 
 
@@ -70,8 +77,14 @@ def _trace_some(  # type: ignore[no-untyped-def]
 ):
     """Rays `first` to `last` of `trace_to_cells`."""
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
+    place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
+    sample, slot, slot_detour = locator.sample, locator.slot, locator.slot_detour
+    distance, instance, triangle, hit_u, hit_v = (
+        out_hits.distance, out_hits.instance, out_hits.triangle, out_hits.u, out_hits.v,
+    )  # fmt: skip
     stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
     valid, rays, words, single, single_words = make_packet()
+    ends, at = make_look_up()
     rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
     for begin in range(first, last, 16):
         n = min(16, last - begin)
@@ -84,28 +97,18 @@ def _trace_some(  # type: ignore[no-untyped-def]
                 rays[4 + c, e] = directions[r, c]
         clear_packet(rays, words)
         trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
+        look_up_cells(
+            valid, rays, words, mesh_begin, instance_mesh, place, face, square, candidates, sample, slot, slot_detour,
+            locator, points, to_world, to_object, triangle_route, stack, bound, ends, at,
+        )  # fmt: skip
         for e in range(n):
-            r = begin + e
-            out_cell[r] = NOTHING
-            out_hits.distance[r] = np.inf
-            out_hits.instance[r] = -1
-            out_hits.triangle[r] = -1
-            out_hits.u[r] = 0.0
-            out_hits.v[r] = 0.0
-            if valid[e] == 0 or words[18, e] == _INVALID:
-                continue
-            i = np.int64(words[18, e] if words[19, e] == _INVALID else words[19, e])
-            t = mesh_begin[instance_mesh[i]] + np.int64(words[17, e])
-            u, v = rays[15, e], rays[16, e]
-            out_hits.distance[r] = rays[8, e]
-            out_hits.instance[r] = i
-            out_hits.triangle[r] = t
-            out_hits.u[r] = u
-            out_hits.v[r] = v
-            dx, dy, dz = rays[4, e], rays[5, e], rays[6, e]
-            out_cell[r] = cell_of_hit(
-                cells, locator, points, to_world, to_object, triangle_route, i, t, u, v, dx, dy, dz, stack, bound
-            )
+            r, is_met = begin + e, ends[INSTANCE, e] >= 0
+            out_cell[r] = ends[CELL, e]
+            instance[r] = ends[INSTANCE, e]
+            triangle[r] = ends[TRIANGLE, e]
+            distance[r] = rays[8, e] if is_met else np.float32(np.inf)
+            hit_u[r] = rays[15, e] if is_met else np.float32(0.0)
+            hit_v[r] = rays[16, e] if is_met else np.float32(0.0)
 
 
 @parallel_kernel

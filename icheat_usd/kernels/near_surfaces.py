@@ -6,7 +6,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.gather_rows import trace_16
+from icheat_usd.kernels.packets import trace_16
 from icheat_usd.kernels.random import hash_combine, sobol_pair
 from icheat_usd.kernels.samples import cosine_direction
 from icheat_usd.kernels.simd import address_of

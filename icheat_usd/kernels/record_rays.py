@@ -6,21 +6,19 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.cell_map import (
-    WALK,
-    entry_at,
-    nearest_listed,
-    place_on,
-    plane_of,
-    side_seen,
-    unit_normal,
+from icheat_usd.kernels.packets import (
+    CELL,
+    INSTANCE,
+    TRIANGLE,
+    clear_packet,
+    look_up_cells,
+    make_look_up,
+    make_packet,
+    trace_16,
 )
-from icheat_usd.kernels.gather_rows import DETOUR, NOTHING, clear_packet, make_packet, trace_16
-from icheat_usd.kernels.locate import nearest_sample
 from icheat_usd.kernels.random import hash_combine, sobol_pair, to_unit
 from icheat_usd.kernels.samples import basis, unit_circle
 
-_INVALID = np.uint32(0xFFFFFFFF)
 _TOUCHING = np.float32(1e-6)  # metres: a ray may end where it starts, in a crease
 _HEMISPHERES = 27  # the bit of a stream from which it counts the hemispheres of one record
 _BLOCK = 4  # strata along each side of a packet: rays of one cone
@@ -60,29 +58,6 @@ def stratum_direction(sx, sy, sz, seed, stream, j, k, n_theta, n_phi):  # type: 
 
 
 @kernel
-def cell_of_hit(  # type: ignore[no-untyped-def]
-    cells, locator, points, to_world, to_object, triangle_route, i, t, u, v, dx, dy, dz, stack, bound
-):
-    """Gather cell that a ray along (dx, dy, dz) ends in on triangle t of instance i: `NOTHING` or `DETOUR` if none."""
-    if triangle_route[t] != 0:
-        return np.int32(DETOUR)
-    plane = plane_of(points, to_object, i, t)
-    if not plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2] > 0.0:
-        return np.int32(NOTHING)
-    side = side_seen(plane, dx, dy, dz)
-    found = entry_at(cells.place, cells.face, cells.square, i, t, side, u, v)
-    if found < 0:
-        px, py, pz = place_on(points, to_world, i, t, u, v)
-        nx, ny, nz = unit_normal(plane, side)
-        if found == WALK:
-            found = nearest_sample(locator, i, side, px, py, pz, nx, ny, nz, stack, bound)
-        else:
-            detour = locator.slot_detour[locator.slot[2 * i + side]]
-            found = nearest_listed(cells.candidates, locator.sample, found, detour, px, py, pz, nx, ny, nz)
-    return np.int32(found)
-
-
-@kernel
 def _trace_hemisphere(  # type: ignore[no-untyped-def]
     r,
     trace,
@@ -108,8 +83,11 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
 ):
     """Row r of `trace_hemispheres`."""
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
+    place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
+    sample, slot, slot_detour = locator.sample, locator.slot, locator.slot_detour
     stack, bound = np.empty((depth + 1, 2), np.int64), np.empty(depth + 1, np.float32)
     valid, rays, words, single, single_words = make_packet()
+    ends, at = make_look_up()
     rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
     sx, sy, sz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
     gx, gy, gz = normal[r, 0], normal[r, 1], normal[r, 2]
@@ -126,26 +104,20 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
                 rays[6, e] = z
             clear_packet(rays, words)
             trace_16(trace, rays, words, valid, rays_at, valid_at, single, single_words, single_at)
+            look_up_cells(
+                valid, rays, words, mesh_begin, instance_mesh, place, face, square, candidates, sample, slot,
+                slot_detour, locator, points, to_world, to_object, triangle_route, stack, bound, ends, at,
+            )  # fmt: skip
             for e in range(16):
                 column = (j0 + e // _BLOCK) * n_phi + k0 + e % _BLOCK
-                out_instance[r, column] = -1
-                out_triangle[r, column] = -1
-                out_cell[r, column] = NOTHING
+                out_cell[r, column] = ends[CELL, e]
+                out_instance[r, column] = ends[INSTANCE, e]
+                out_triangle[r, column] = ends[TRIANGLE, e]
                 out_distance[r, column] = np.inf
-                if valid[e] == 0 or words[18, e] == _INVALID:
-                    continue
-                i = np.int64(words[18, e] if words[19, e] == _INVALID else words[19, e])
-                t = mesh_begin[instance_mesh[i]] + np.int64(words[17, e])
-                u, v = rays[15, e], rays[16, e]
-                out_instance[r, column] = i
-                out_triangle[r, column] = t
-                out_uv[r, column, 0] = u
-                out_uv[r, column, 1] = v
-                out_distance[r, column] = rays[8, e]
-                dx, dy, dz = rays[4, e], rays[5, e], rays[6, e]
-                out_cell[r, column] = cell_of_hit(
-                    cells, locator, points, to_world, to_object, triangle_route, i, t, u, v, dx, dy, dz, stack, bound
-                )
+                if ends[INSTANCE, e] >= 0:
+                    out_uv[r, column, 0] = rays[15, e]
+                    out_uv[r, column, 1] = rays[16, e]
+                    out_distance[r, column] = rays[8, e]
 
 
 @parallel_kernel
