@@ -10,11 +10,12 @@ them are long, and all rays that end in one get the mean of its first few paths.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from icheat_usd.final_gather.hits import INVERSE_PI, trace_hemisphere
+from icheat_usd.kernels.patch_table import PatchTable, add_light, ask, mean_light, move_patches
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import LightSampler, irradiance
 from icheat_usd.materials import effective_albedo, take_points
@@ -30,6 +31,7 @@ EVEN = 0.15
 _NEIGHBOURS = 8
 
 _VERTICES = 2  # of a path between near surfaces, at most
+_FIRST_ROOM = 1 << 16  # rows of the table of patches, which doubles when it is half full
 
 
 @dataclass(eq=False)
@@ -51,46 +53,38 @@ class NearLight:
     cells: F32
     n_paths: int
     seed: int
-    _key: U64 = field(default_factory=lambda: np.empty(0, np.uint64))  #: (p,) ascending
-    _sum: F64 = field(default_factory=lambda: np.empty((0, 3)))  #: (p, 3) of the paths of each patch
-    _number: I64 = field(default_factory=lambda: np.empty(0, np.int64))  #: (p,) of paths
 
     def __post_init__(self) -> None:
         widths = np.float32(WIDTHS) * np.sqrt(self.gather.area.astype(np.float32))
         widths[_unevenness(self.cells) < EVEN] = 0
         self._reach = np.append(widths, np.float32(0))
+        self._patches, self._n_patches = _table(_FIRST_ROOM), 0
 
     def is_near(self, distance: F32, cell: I32) -> Bool:
         """Whether hits in some cells, -1 for none, are near."""
         return np.asarray(distance < np.take(self._reach, cell), np.bool_)
 
-    def wanted(self, key: U64) -> tuple[I64, Bool]:
-        """Order of hits by patch, and which of them, in that order, need a path."""
-        order = np.argsort(key, kind="stable")
-        ascending = key[order]
-        first = np.flatnonzero(np.concatenate([[True], ascending[1:] != ascending[:-1]]))
-        length = np.diff(np.append(first, len(key)))
-        rank = np.arange(len(key)) - np.repeat(first, length)
-        at = np.minimum(np.searchsorted(self._key, ascending[first]), max(len(self._key) - 1, 0))
-        have = np.zeros(len(first), np.int64)
-        if len(self._key):
-            have = np.where(self._key[at] == ascending[first], self._number[at], 0)
-        return order, rank < np.repeat(self.n_paths - have, length)
+    def wanted(self, key: U64) -> Bool:
+        """Which hits in some patches need a path, the first of each patch; `learn` has to follow."""
+        is_wanted, first = np.empty(len(key), np.bool_), 0
+        while True:
+            keys, number, _ = self._patches
+            first, self._n_patches = ask(keys, number, self._n_patches, key, first, self.n_paths, is_wanted)
+            if first == len(key):
+                return is_wanted
+            larger = _table(2 * len(keys))
+            move_patches(*self._patches, *larger)
+            self._patches = larger
 
     def learn(self, key: U64, points: SurfacePoints, stream: I64) -> None:
-        """Paths from hits in some patches; `stream` (n,) numbers their random sequences."""
-        light = self._paths(points, stream).astype(np.float64)
-        joined = np.concatenate([self._key, key])
-        self._key, where = np.unique(joined, return_inverse=True)
-        n, light = len(self._key), np.concatenate([self._sum, light])
-        self._sum = np.stack([np.bincount(where, light[:, channel], n) for channel in range(3)], axis=1)
-        number = np.concatenate([self._number, np.ones(len(key), np.int64)])
-        self._number = np.bincount(where, number, n).astype(np.int64)
+        """Paths from the hits that are wanted; `stream` (n,) numbers their random sequences."""
+        add_light(*self._patches, key, self._paths(points, stream))
 
     def radiance(self, key: U64) -> F32:
         """Radiance of hits in patches that are known, (n, 3)."""
-        mean = (self._sum / self._number[:, None]).astype(np.float32)
-        return np.take(mean, np.searchsorted(self._key, key), axis=0)
+        out = np.empty((len(key), 3), np.float32)
+        mean_light(*self._patches, key, out)
+        return out
 
     def _paths(self, points: SurfacePoints, stream: I64) -> F32:
         """Radiance that points reflect, (n, 3), by one path from each."""
@@ -114,6 +108,10 @@ class NearLight:
             if len(alive) == 0:
                 break
         return out
+
+
+def _table(room: int) -> PatchTable:
+    return PatchTable(np.empty(room, np.uint64), np.full(room, -1, np.int32), np.zeros((room, 3)))
 
 
 def _unevenness(cells: F32) -> F64:

@@ -142,8 +142,7 @@ class HemisphereTracer:
             flat,
             key,
         )
-        order, is_wanted = self._near.wanted(key)
-        new = np.sort(order[is_wanted])
+        new = np.flatnonzero(self._near.wanted(key))
         if len(new):
             row, ray = flat[new] // rays.n_rays, flat[new] % rays.n_rays
             self._near.learn(key[new], rays.ends(self._snapshot, flat[new]), rays.stream[row] * rays.n_rays + ray)

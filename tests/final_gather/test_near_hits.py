@@ -35,13 +35,13 @@ def test_in_a_furnace_near_hits_send_the_light_of_the_furnace():
     n_patches = 16
     key = np.sort(np.arange(len(points.instance)) % n_patches).astype(np.uint64)
     assert len(key) // n_patches > N_PATHS
-    order, is_wanted = near.wanted(key)
-    chosen = np.sort(order[is_wanted])
+    chosen = np.flatnonzero(near.wanted(key))
     assert np.bincount(key[chosen].astype(np.int64)).tolist() == [N_PATHS] * n_patches
     near.learn(key[chosen], take_points(points, chosen), chosen)
-    assert not near.wanted(key)[1].any()
+    assert not near.wanted(key).any()
 
     every = np.arange(len(key), dtype=np.uint64)
+    assert near.wanted(every + np.uint64(n_patches)).all()
     near.learn(every + np.uint64(n_patches), points, every.astype(np.int64))
     light = near.radiance(every + np.uint64(n_patches)).mean(axis=1)
     error = light.std() / np.sqrt(len(light))
