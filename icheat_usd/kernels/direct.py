@@ -9,64 +9,21 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.dome_rays import DISTANCE, PDF, RADIANCE
 from icheat_usd.kernels.environment import F32, F64, Table
-from icheat_usd.kernels.guide import (
-    COSINE_SHARE,
-    find_row,
-    image_density,
-    plain_dome_pdf,
-    sphere_direction,
-    warp,
-)
+from icheat_usd.kernels.guide import find_row, image_density, plain_dome_pdf
 from icheat_usd.kernels.light_hits import hit_shape
+from icheat_usd.kernels.light_rays import ask_rays, find_rays, make_asked
 from icheat_usd.kernels.light_triangles import mesh_pdf, sample_mesh
-from icheat_usd.kernels.lights import light_shape, sample_shape
+from icheat_usd.kernels.lights import light_shape
 from icheat_usd.kernels.random import hash_combine, sobol_pair
-from icheat_usd.kernels.vector import row3
+from icheat_usd.kernels.vector import dot, row3
 
 _DOME = 5
+_CHUNK = 256  # points that share buffers
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
-
-
-@kernel
-def sequence_of(draws, i, light, seed):  # type: ignore[no-untyped-def]
-    """Sequence of random numbers of point i's rays to a light."""
-    return hash_combine(hash_combine(hash_combine(seed, 0x11), draws[i, 0]), light)
-
-
-@kernel
-def analytic_ray(  # type: ignore[no-untyped-def]
-    kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, bands, columns, guided, place, normal,
-    shading_normal, u1, u2,
-):  # fmt: skip
-    """Direction, distance, density and relative radiance of a ray to a light that is no mesh.
-
-    `kind` to `image` as of `light_shape`; `guided` is the guide's row, or -1. The density is 0 where the ray brings
-    nothing: it misses the light, or leaves below either horizon.
-    """
-    px, py, pz = place
-    gx, gy, gz = normal
-    nx, ny, nz = shading_normal
-    v1, v2 = float(u1), float(u2)
-    factor = 1.0
-    if guided >= 0 and image[0] >= 0:
-        v1, v2, factor = warp(bands, columns, guided, v1, v2)
-    elif guided >= 0:
-        v1 /= COSINE_SHARE
-    wx, wy, wz, t, p, r, g, b = sample_shape(
-        kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, px, py, pz, nx, ny, nz, min(v1, 1.0), v2
-    )
-    p *= factor
-    if guided >= 0 and image[0] < 0:
-        if v1 >= 1.0:
-            v1, v2, factor = warp(bands, columns, guided, (u1 - COSINE_SHARE) / (1.0 - COSINE_SHARE), float(u2))
-            wx, wy, wz = sphere_direction(v1, v2)
-        p = plain_dome_pdf(bands, columns, guided, nx, ny, nz, wx, wy, wz)
-    if p > 0.0 and (wx * nx + wy * ny + wz * nz <= 0.0 or wx * gx + wy * gy + wz * gz <= 0.0):
-        p = 0.0
-    return wx, wy, wz, t, p, r, g, b
 
 
 @parallel_kernel
@@ -95,40 +52,49 @@ def fill_analytic(
     times the shading cosine if `cosine`; zero below either horizon. `draws` (n, 2) are each point's sequence of
     random numbers and the number in it of the first one.
     """
-    kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
+    n = len(instance)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        _fill_chunk(
+            chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), lights, textures, tables, guide, light, position, normal,
+            shading_normal, instance, draws, n_samples, seed, cosine, direction, distance, pdf, radiance,
+        )  # fmt: skip
+
+
+@kernel
+def _fill_chunk(  # type: ignore[no-untyped-def]
+    first, end, lights, textures, tables, guide, light, position, normal, shading_normal, instance, draws, n_samples,
+    seed, cosine, direction, distance, pdf, radiance,
+):  # fmt: skip
+    shape = light_shape(lights, textures, tables, light)
     texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
     axis, split, child, rows, bands, columns = guide
     red, green, blue = lights.radiance[light, 0], lights.radiance[light, 1], lights.radiance[light, 2]
-    for i in prange(position.shape[0]):
-        if instance[i] < 0:
-            continue
-        sequence = sequence_of(draws, i, light, seed)
-        place, upwards, about = row3(position, i), row3(normal, i), row3(shading_normal, i)
-        guided = -1
-        if kind == _DOME:
-            guided = find_row(
-                axis, split, child, rows, light, place[0], place[1], place[2], about[0], about[1], about[2]
-            )
-        for k in range(n_samples):
-            u1, u2 = sobol_pair(draws[i, 1] + k, sequence)
-            wx, wy, wz, t, p, r, g, b = analytic_ray(
-                kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, bands, columns, guided, place, upwards,
-                about, u1, u2,
-            )  # fmt: skip
-            if p <= 0.0:
+    asked = make_asked()
+    ray = asked.ray
+    i, k = first, 0
+    while i < end:
+        n, i, k = ask_rays(
+            asked, i, k, end, instance, draws, n_samples, seed, light, shape[0], axis, split, child, rows, position,
+            shading_normal,
+        )  # fmt: skip
+        find_rays(
+            n, asked, shape, texels, rows_cdf, columns_cdf, bands, columns, position, normal, shading_normal
+        )  # fmt: skip
+        for a in range(n):
+            if ray[a, PDF] <= 0.0:
                 continue
-            weight = 1.0 / (p * n_samples)
+            at = asked.point[a]
+            row = at * n_samples + asked.sample[a]
+            weight = 1.0 / (ray[a, PDF] * n_samples)
             if cosine:
-                weight *= wx * about[0] + wy * about[1] + wz * about[2]
-            row = i * n_samples + k
-            direction[row, 0] = wx
-            direction[row, 1] = wy
-            direction[row, 2] = wz
-            distance[row] = t
-            pdf[row] = p
-            radiance[row, 0] = r * weight * red
-            radiance[row, 1] = g * weight * green
-            radiance[row, 2] = b * weight * blue
+                weight *= dot((ray[a, 0], ray[a, 1], ray[a, 2]), row3(shading_normal, at))
+            for c in range(3):
+                direction[row, c] = ray[a, c]
+            distance[row] = ray[a, DISTANCE]
+            pdf[row] = ray[a, PDF]
+            radiance[row, 0] = ray[a, RADIANCE] * weight * red
+            radiance[row, 1] = ray[a, RADIANCE + 1] * weight * green
+            radiance[row, 2] = ray[a, RADIANCE + 2] * weight * blue
 
 
 @parallel_kernel

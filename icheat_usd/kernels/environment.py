@@ -146,10 +146,20 @@ def sample_dome_image(
     A texel is chosen in proportion to its weight, then a direction uniform in solid angle in it.
     """
     row = search_cdf(rows_cdf, rows_begin, rows_begin + height, u2) - rows_begin
+    first = columns_begin + row * width
+    column = search_cdf(columns_cdf, first, first + width, u1) - first
+    return place_in_texel(rows_cdf, rows_begin, columns_cdf, columns_begin, width, height, row, column, u1, u2)
+
+
+@kernel
+def place_in_texel(
+    rows_cdf: F64, rows_begin: int, columns_cdf: F32, columns_begin: int, width: int, height: int,
+    row: int, column: int, u1: float, u2: float,
+) -> Floats:  # fmt: skip
+    """What `sample_dome_image` returns in the texel that it has chosen."""
     below = rows_cdf[rows_begin + row - 1] if row > 0 else 0.0
     p_row = rows_cdf[rows_begin + row] - below
     first = columns_begin + row * width
-    column = search_cdf(columns_cdf, first, first + width, u1) - first
     left = columns_cdf[first + column - 1] if column > 0 else 0.0
     p_column = columns_cdf[first + column] - left
     if p_row <= 0.0 or p_column <= 0.0:

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from icheat_usd.kernels._jit import kernel
 from icheat_usd.kernels.cell_map import (
@@ -22,6 +16,7 @@ from icheat_usd.kernels.cell_map import (
     unit_normal,
 )
 from icheat_usd.kernels.embree import call_1, call_packet
+from icheat_usd.kernels.fetch import fetch
 from icheat_usd.kernels.locate import nearest_sample
 
 NOTHING = -1  # cell of a ray that ends nowhere: below its surface, or on a degenerate triangle
@@ -29,25 +24,6 @@ DETOUR = -2  # cell of a ray that ended on a triangle that does not simply refle
 INVALID = np.uint32(0xFFFFFFFF)  # what Embree calls no geometry
 CELL, INSTANCE, TRIANGLE = 0, 1, 2  #: rows of `look_up_cells`
 _SIDE, _SQUARE, _LISTED, _ROWS = 3, 4, 5, 6  # and what it keeps in others
-
-
-@cast(Any, intrinsic)  # as a caller sees it: without the typing context
-def _fetch(typingctx: Any, column: Any, row: Any) -> Any:
-    """Begin to load row `row` of a C-contiguous array, which is not waited for; it may lie behind the last."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, args[0])
-        stride = builder.extract_value(array.strides, 0)
-        pointer = ir.IntType(8).as_pointer()
-        base = builder.ptrtoint(array.data, stride.type)
-        address = builder.inttoptr(builder.add(base, builder.mul(stride, args[1])), pointer)
-        number = ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
-        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        builder.call(callee, [address, ir.Constant(number, 0), ir.Constant(number, 3), ir.Constant(number, 1)])
-        return context.get_dummy_value()
-
-    return types.void(column, types.int64), codegen
 
 
 @kernel
@@ -153,10 +129,10 @@ def look_up_cells(  # type: ignore[no-untyped-def]
             t = mesh_begin[instance_mesh[i]] + np.int64(words[17, k])
             found[INSTANCE, k] = i
             found[TRIANGLE, k] = t
-            _fetch(points, t)
-            _fetch(points, t + 1)  # a triangle may lie on two lines of the cache
-            _fetch(triangle_route, t)
-            _fetch(face, max(0, 2 * (place[i] + t)))
+            fetch(points, t)
+            fetch(points, t + 1)  # a triangle may lie on two lines of the cache
+            fetch(triangle_route, t)
+            fetch(face, max(0, 2 * (place[i] + t)))
     for k in range(16):
         i, t = found[INSTANCE, k], found[TRIANGLE, k]
         found[_LISTED, k] = 0
@@ -178,7 +154,7 @@ def look_up_cells(  # type: ignore[no-untyped-def]
             f = 2 * (place[i] + t) + side
             found[CELL, k] = face[f, 0]
             found[_SQUARE, k] = square_at(face, f, rays[15, k], rays[16, k])
-            _fetch(square, max(found[_SQUARE, k], 0))
+            fetch(square, max(found[_SQUARE, k], 0))
     for k in range(16):
         if found[_LISTED, k] == 0:
             continue
@@ -189,7 +165,7 @@ def look_up_cells(  # type: ignore[no-untyped-def]
             found[_LISTED, k] = 0
             continue
         if entry != WALK:
-            _fetch(candidates, -1 - entry)
+            fetch(candidates, -1 - entry)
         i, t, plane = found[INSTANCE, k], found[TRIANGLE, k], (at[k, 6], at[k, 7], at[k, 8])
         at[k, 0], at[k, 1], at[k, 2] = place_on(points, to_world, i, t, rays[15, k], rays[16, k])
         at[k, 3], at[k, 4], at[k, 5] = unit_normal(plane, found[_SIDE, k])
@@ -197,7 +173,7 @@ def look_up_cells(  # type: ignore[no-untyped-def]
         if found[_LISTED, k] == 1 and found[CELL, k] != WALK:
             begin = -found[CELL, k]
             for a in range(begin, begin + min(candidates[begin - 1], 4)):
-                _fetch(sample, candidates[a])
+                fetch(sample, candidates[a])
     for k in range(16):
         if found[_LISTED, k] == 0:
             continue

@@ -10,15 +10,13 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.bsdf import ggx_density, lobe_alpha, lobe_cosines, smith_lambda, specular_terms
-from icheat_usd.kernels.direct import analytic_ray, sequence_of
+from icheat_usd.kernels.dome_rays import DISTANCE, PDF, RADIANCE
 from icheat_usd.kernels.embree import call_1, call_packet
-from icheat_usd.kernels.guide import find_row
+from icheat_usd.kernels.light_rays import ask_rays, find_rays, make_asked
 from icheat_usd.kernels.lights import light_shape
-from icheat_usd.kernels.random import sobol_pair
 from icheat_usd.kernels.simd import address_of
 from icheat_usd.kernels.vector import dot, normalized, plus_scaled, row3
 
-_DOME = 5
 _CHUNK = 256  # points that share buffers
 _INVALID = np.uint32(0xFFFFFFFF)
 
@@ -77,48 +75,46 @@ def _add_to_chunk(  # type: ignore[no-untyped-def]
     single = storage[shift + 13 * 16 : shift + 13 * 16 + 16]
     owner, value, brought = np.empty(16, np.int64), np.empty((16, 3), np.float32), np.empty(16, np.float32)
     total = np.zeros((end - first, 3), np.float64)
-    kind, m, inverse, size, image = light_shape(lights, textures, tables, light)
+    shape = light_shape(lights, textures, tables, light)
     texels, rows_cdf, columns_cdf = textures.texels, tables.rows_cdf, tables.columns_cdf
     axis, split, child, rows, bands, columns = guide
     position, normal, shading_normal, delta = points.position, points.normal, points.shading_normal, points.delta
     albedo, roughness, specular, specular_edge = points.albedo, points.roughness, points.specular, points.specular_edge
     red, green, blue = lights.radiance[light, 0], lights.radiance[light, 1], lights.radiance[light, 2]
     function, scene, arguments, packets = trace.function, trace.scene, trace.arguments, trace.packets
-    n = 0
-    for i in range(first, end):
-        if instance[i] < 0:
-            continue
-        sequence = sequence_of(draws, i, light, seed)
-        place, upwards, about = row3(position, i), row3(normal, i), row3(shading_normal, i)
-        guided = -1
-        if kind == _DOME:
-            guided = find_row(
-                axis, split, child, rows, light, place[0], place[1], place[2], about[0], about[1], about[2]
-            )
-        has_eye = len(to_eye) > 0
-        eye = normalized(row3(to_eye, i)) if has_eye else about
-        tint, lobe, edge_of_lobe = row3(albedo, i), row3(specular, i), row3(specular_edge, i)
-        shines = delta[i] == 0 and max(max(lobe), max(edge_of_lobe)) > 0.0
-        alpha = lobe_alpha(roughness[i])
-        for k in range(n_samples):
-            u1, u2 = sobol_pair(draws[i, 1] + k, sequence)
-            wx, wy, wz, t, p, r, g, b = analytic_ray(
-                kind, m, inverse, size, image, texels, rows_cdf, columns_cdf, bands, columns, guided, place, upwards,
-                about, u1, u2,
-            )  # fmt: skip
+    has_eye = len(to_eye) > 0
+    asked = make_asked()
+    ray = asked.ray
+    n, i, k = 0, first, 0
+    while i < end:
+        n_asked, i, k = ask_rays(
+            asked, i, k, end, instance, draws, n_samples, seed, light, shape[0], axis, split, child, rows, position,
+            shading_normal,
+        )  # fmt: skip
+        find_rays(
+            n_asked, asked, shape, texels, rows_cdf, columns_cdf, bands, columns, position, normal, shading_normal
+        )
+        for a in range(n_asked):
+            p = ray[a, PDF]
             if p <= 0.0:
                 continue
+            at = asked.point[a]
+            wx, wy, wz = ray[a, 0], ray[a, 1], ray[a, 2]
+            about = row3(shading_normal, at)
             cosine = about[0] * wx + about[1] * wy + about[2] * wz
             share = 1.0 / (p * n_samples)
             if not has_eye:
                 share *= cosine
-            r, g, b = np.float32(r * share * red), np.float32(g * share * green), np.float32(b * share * blue)
+            r = np.float32(ray[a, RADIANCE] * share * red)
+            g = np.float32(ray[a, RADIANCE + 1] * share * green)
+            b = np.float32(ray[a, RADIANCE + 2] * share * blue)
             if has_eye:
-                to_light = normalized((wx, wy, wz))
+                upwards, eye, to_light = row3(normal, at), normalized(row3(to_eye, at)), normalized((wx, wy, wz))
+                tint, lobe, edge_of_lobe = row3(albedo, at), row3(specular, at), row3(specular_edge, at)
                 diffuse = lobe_cosines(about, upwards, eye, to_light)[1] / math.pi * weights.diffuse
                 x, y, z = tint[0] * diffuse, tint[1] * diffuse, tint[2] * diffuse
-                if shines:
-                    base, edge = _lobe_factors(about, upwards, eye, to_light, alpha, p, weights)
+                if delta[at] == 0 and max(max(lobe), max(edge_of_lobe)) > 0.0:
+                    base, edge = _lobe_factors(about, upwards, eye, to_light, lobe_alpha(roughness[at]), p, weights)
                     x += lobe[0] * base + edge_of_lobe[0] * edge
                     y += lobe[1] * base + edge_of_lobe[1] * edge
                     z += lobe[2] * base + edge_of_lobe[2] * edge
@@ -127,29 +123,17 @@ def _add_to_chunk(  # type: ignore[no-untyped-def]
             value[n, 0], value[n, 1], value[n, 2] = r * x, g * y, b * z
             if value[n, 0] == 0.0 and value[n, 1] == 0.0 and value[n, 2] == 0.0:
                 continue
-            owner[n] = i - first
+            owner[n] = at - first
             brought[n] = max(r, g, b) * cosine if has_eye else max(r, g, b)
-            rays[0, n], rays[1, n], rays[2, n] = start[i, 0], start[i, 1], start[i, 2]
+            rays[0, n], rays[1, n], rays[2, n] = start[at, 0], start[at, 1], start[at, 2]
             rays[4, n], rays[5, n], rays[6, n] = wx, wy, wz
-            rays[8, n] = np.float32(t) * np.float32(weights.stop_short)
+            rays[8, n] = np.float32(ray[a, DISTANCE]) * np.float32(weights.stop_short)
             n += 1
             if n == 16:
                 _trace_and_add(
-                    function,
-                    scene,
-                    arguments,
-                    packets,
-                    n,
-                    rays,
-                    valid,
-                    single,
-                    owner,
-                    value,
-                    brought,
-                    total,
-                    first,
+                    function, scene, arguments, packets, n, rays, valid, single, owner, value, brought, total, first,
                     extremes,
-                )
+                )  # fmt: skip
                 n = 0
     _trace_and_add(
         function, scene, arguments, packets, n, rays, valid, single, owner, value, brought, total, first, extremes
