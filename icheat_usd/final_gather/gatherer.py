@@ -11,8 +11,9 @@ from icheat_usd.edits.bound import Ends
 from icheat_usd.edits.field import EditField
 from icheat_usd.edits.offsets import OffsetCasters
 from icheat_usd.edits.pairs import PairLight, edited_light
+from icheat_usd.final_gather.cell_rays import CellRays
 from icheat_usd.final_gather.hits import GatherRays, Reflected, reflected_radiance, trace_hemisphere, trace_specular
-from icheat_usd.final_gather.lobe_rays import LobeRays, trace_lobe
+from icheat_usd.final_gather.lobe_rays import trace_lobe
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import LightSampler
 from icheat_usd.materials import is_glossy, take_points
@@ -71,7 +72,7 @@ class Lobe(NamedTuple):
     """Rays of one lobe of some of the points, and the light that they bring."""
 
     where: I64  #: (m,) points that have the lobe
-    rays: GatherRays | LobeRays  #: (m * n_rays,)
+    rays: GatherRays | CellRays  #: (m * n_rays,)
     light: Reflected
     tint: F32  #: (m, 3) reflectance outside the rays' throughput
     seed: int
@@ -159,7 +160,7 @@ def specular_lobe(
     own = int(hash_combine(seed, 7))
     shiny = take_points(points, glossy)
     asked = to_eye[glossy], draws[glossy], n_rays, own
-    rays: GatherRays | LobeRays | None = None
+    rays: GatherRays | CellRays | None = None
     if not g.follows_paths:
         assert g.solution is not None
         rays = trace_lobe(g.snapshot, g.tracer, g.solution.gather, shiny, *asked)
@@ -168,13 +169,13 @@ def specular_lobe(
     return _lit(g, glossy, rays, np.ones((len(glossy), 3), np.float32), int(hash_combine(own, 2)))
 
 
-def _lit(gatherer: Gatherer, where: I64, rays: GatherRays | LobeRays, tint: F32, seed: int) -> Lobe:
+def _lit(gatherer: Gatherer, where: I64, rays: GatherRays | CellRays, tint: F32, seed: int) -> Lobe:
     return Lobe(where, rays, _brought(gatherer, rays, int(hash_combine(seed, 11))), tint, seed)
 
 
-def _brought(gatherer: Gatherer, rays: GatherRays | LobeRays, seed: int) -> Reflected:
+def _brought(gatherer: Gatherer, rays: GatherRays | CellRays, seed: int) -> Reflected:
     """Light that rays bring."""
-    if isinstance(rays, LobeRays) or not gatherer.follows_paths:
+    if isinstance(rays, CellRays) or not gatherer.follows_paths:
         assert gatherer.solution is not None
         return _sent(gatherer.solution, rays.cells(gatherer.solution.gather), rays.throughput)
     return _reflected(gatherer, rays.ends, rays.throughput, seed)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icheat_usd.final_gather.cell_rays import CellRays, trace_to_cells
 from icheat_usd.kernels.direct import fill_specular_numbers
 from icheat_usd.kernels.gather import uniforms
 from icheat_usd.kernels.random import hash_combine
@@ -38,6 +39,10 @@ class GatherRays(NamedTuple):
         """Gather cells that the rays end in; -1 for none."""
         return gather.locate(self.ends)
 
+    def distances(self) -> F32:
+        """Metres from start to end, in a straight line; anything where there is no end."""
+        return np.asarray(np.linalg.norm(self.ends.position - self.origins, axis=1), np.float32)
+
 
 def trace_hemisphere(
     snapshot: SceneSnapshot, tracer: Tracer, points: SurfacePoints, stream: I64, n_rays: int, seed: int
@@ -46,6 +51,33 @@ def trace_hemisphere(
 
     Rays that would point below the geometric surface have throughput 0.
     """
+    origins, directions = _hemisphere(snapshot, points, stream, n_rays, seed)
+    seed = int(hash_combine(seed, 1))
+    ends = first_surfaces(snapshot, tracer, origins, directions, seed)
+    return GatherRays(ends.points, ends.throughput * (ends.points.instance >= 0)[:, None], origins, directions, seed)
+
+
+def trace_hemisphere_to_cells(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    gather: GatherSamples,
+    points: SurfacePoints,
+    stream: I64,
+    n_rays: int,
+    seed: int,
+) -> GatherRays | CellRays:
+    """`trace_hemisphere`, for callers that want cells first."""
+    if tracer.compiled() is None:
+        return trace_hemisphere(snapshot, tracer, points, stream, n_rays, seed)
+    origins, directions = _hemisphere(snapshot, points, stream, n_rays, seed)
+    reflectance = np.repeat(nonzero_rows(directions)[:, None], 3, axis=1).astype(np.float32)
+    rays = trace_to_cells(snapshot, tracer, gather, origins, directions, reflectance, int(hash_combine(seed, 1)))
+    assert rays is not None
+    return rays
+
+
+def _hemisphere(snapshot: SceneSnapshot, points: SurfacePoints, stream: I64, n_rays: int, seed: int) -> tuple[F32, F32]:
+    """Starts and directions of `n_rays` cosine-weighted rays from each point."""
     n = len(stream)
     origins, directions = np.empty((n * n_rays, 3), np.float32), np.empty((n * n_rays, 3), np.float32)
     cosine_rays(
@@ -60,9 +92,7 @@ def trace_hemisphere(
         origins,
         directions,
     )
-    seed = int(hash_combine(seed, 1))
-    ends = first_surfaces(snapshot, tracer, origins, directions, seed)
-    return GatherRays(ends.points, ends.throughput * (ends.points.instance >= 0)[:, None], origins, directions, seed)
+    return origins, directions
 
 
 def trace_specular(

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icheat_usd.final_gather.hits import INVERSE_PI, trace_hemisphere
+from icheat_usd.final_gather.hits import INVERSE_PI, trace_hemisphere_to_cells
 from icheat_usd.kernels.patch_table import PatchTable, add_light, ask, mean_light, move_patches
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting import LightSampler, irradiance
-from icheat_usd.materials import effective_albedo, take_points
+from icheat_usd.materials import effective_albedo
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, U64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer
@@ -96,15 +96,16 @@ class NearLight:
             carried = carried * effective_albedo(points)
             direct = irradiance(self.snapshot, self.tracer, self.sampler, points, step, 1).sum(axis=0)
             out[alive] += carried * direct * INVERSE_PI
-            rays = trace_hemisphere(self.snapshot, self.tracer, points, stream[alive], 1, int(hash_combine(step, 2)))
+            rays = trace_hemisphere_to_cells(
+                self.snapshot, self.tracer, self.gather, points, stream[alive], 1, int(hash_combine(step, 2))
+            )
             carried = carried * rays.throughput
-            cell = self.gather.locate(rays.ends)
-            distance = np.linalg.norm(rays.ends.position - rays.origins, axis=1).astype(np.float32)
-            goes_on = self.is_near(distance, cell) if vertex + 1 < _VERTICES else np.zeros(len(cell), np.bool_)
+            cell = rays.cells(self.gather)
+            goes_on = self.is_near(rays.distances(), cell) if vertex + 1 < _VERTICES else np.zeros(len(cell), np.bool_)
             done = np.flatnonzero((cell >= 0) & ~goes_on)
             out[alive[done]] += carried[done] * np.take(self.cells, cell[done], axis=0)
             some = np.flatnonzero(goes_on & carried.any(axis=1))
-            alive, carried, points = alive[some], carried[some], take_points(rays.ends, some)
+            alive, carried, points = alive[some], carried[some], rays.ends_of(self.snapshot, some)
             if len(alive) == 0:
                 break
         return out

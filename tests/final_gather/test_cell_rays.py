@@ -1,4 +1,4 @@
-"""Rays of specular lobes in one pass: against the same rays made, traced and looked up one step after another."""
+"""Rays to gather cells in one pass: against the same rays made, traced and looked up one step after another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pytest
 
 from icheat_usd.edits.model import Edit
 from icheat_usd.final_gather import gatherer
-from icheat_usd.final_gather.hits import trace_specular
+from icheat_usd.final_gather.cell_rays import CellRays
+from icheat_usd.final_gather.hits import trace_hemisphere, trace_hemisphere_to_cells, trace_specular
 from icheat_usd.final_gather.lobe_rays import trace_lobe
 from icheat_usd.materials import is_glossy, take_points
 from tests.pipeline import TINY, Pipeline, select
@@ -42,6 +43,24 @@ def test_one_pass_finds_what_single_steps_find(scene):
         np.testing.assert_array_equal(getattr(found, name), getattr(steps, name), err_msg=name)
     lit = np.flatnonzero(found.throughput.any(axis=1))
     np.testing.assert_array_equal(found.cells(parts.gather)[lit], steps.cells(parts.gather)[lit])
+    for one, other in zip(found.ends_of(scene, lit), steps.ends_of(scene, lit), strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+
+
+@pytest.mark.parametrize("scene", [room(24), with_detours()], ids=["plain", "over mirrors and through a veil"])
+def test_hemispheres_in_one_pass_are_those_of_single_steps(scene):
+    parts = Pipeline(scene, n_gather=256, samples_per_pixel=2)
+    points = parts.view.points
+    stream = np.arange(len(points.instance))
+    found = trace_hemisphere_to_cells(scene, parts.tracer, parts.gather, points, stream, 2, SEED)
+    steps = trace_hemisphere(scene, parts.tracer, points, stream, 2, SEED)
+    assert isinstance(found, CellRays) and (len(found.detour) > 20) == (scene.materials.opacity.min() < 1)
+    for name in ("origins", "directions", "throughput"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(steps, name), err_msg=name)
+    lit = np.flatnonzero(found.throughput.any(axis=1))
+    assert len(lit) > 0.9 * len(stream)
+    np.testing.assert_array_equal(found.cells(parts.gather)[lit], steps.cells(parts.gather)[lit])
+    np.testing.assert_allclose(found.distances()[lit], steps.distances()[lit], rtol=1e-5, atol=1e-6)
     for one, other in zip(found.ends_of(scene, lit), steps.ends_of(scene, lit), strict=True):
         np.testing.assert_allclose(one, other, atol=2e-5)
 
