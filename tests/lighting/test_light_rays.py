@@ -80,5 +80,6 @@ def test_rays_are_those_of_single_samples(case, n_samples):
     assert (pdf > 0).mean() > 0.05 and not pdf[5 * n_samples : 40 * n_samples].any()
     rays = np.hstack([direction, distance, pdf])
     # The frame of a rectangle is float32 in compiled loops, and double when it has passed through Python.
-    np.testing.assert_allclose(rays, wanted[:, :5], rtol=1e-5 if case == "rectangle" else 0)
-    np.testing.assert_allclose(radiance, wanted[:, 5:], rtol=1e-5 if case == "rectangle" else 1e-6)
+    rtol, atol = (1e-5, 1e-7) if case == "rectangle" else (0, 0)
+    np.testing.assert_allclose(rays, wanted[:, :5], rtol=rtol, atol=atol)
+    np.testing.assert_allclose(radiance, wanted[:, 5:], rtol=max(rtol, 1e-6), atol=atol)
