@@ -27,18 +27,18 @@ EFFORTS: dict[str, RenderEffort] = {
     "cached quick": _cached(
         8_192,
         32,
-        1,
+        4,
         GatherSettings(
             1,
             light_samples=1,
-            edge_samples=1,
+            edge_samples=3,
             cache=CacheSettings(n_theta=8, noise=0.2, least_reach=5.0, most_reach=24.0, coverage=0.3, near_paths=0),
         ),
     ),
     "cached 0": _cached(
         16_384,
         64,
-        2,
+        4,
         GatherSettings(
             1, light_samples=1, edge_samples=3, cache=CacheSettings(noise=0.05, least_reach=3.0, most_reach=24.0)
         ),
@@ -46,7 +46,7 @@ EFFORTS: dict[str, RenderEffort] = {
     "cached 1": _cached(
         32_768,
         64,
-        2,
+        4,
         GatherSettings(1, light_samples=1, edge_samples=7, cache=CacheSettings(noise=0.03, most_reach=24.0)),
     ),
     "cached 2": _cached(
