@@ -31,6 +31,7 @@ EFFORTS: dict[str, RenderEffort] = {
         GatherSettings(
             1,
             light_samples=1,
+            dome_samples=8,
             edge_samples=3,
             cache=CacheSettings(n_theta=8, noise=0.2, least_reach=5.0, most_reach=24.0, coverage=0.3, near_paths=0),
         ),
@@ -40,25 +41,38 @@ EFFORTS: dict[str, RenderEffort] = {
         64,
         4,
         GatherSettings(
-            1, light_samples=1, edge_samples=3, cache=CacheSettings(noise=0.05, least_reach=3.0, most_reach=24.0)
+            1,
+            light_samples=1,
+            dome_samples=16,
+            edge_samples=3,
+            cache=CacheSettings(noise=0.05, least_reach=3.0, most_reach=24.0),
         ),
     ),
     "cached 1": _cached(
         32_768,
         64,
         4,
-        GatherSettings(1, light_samples=1, edge_samples=7, cache=CacheSettings(noise=0.03, most_reach=24.0)),
+        GatherSettings(
+            1, light_samples=1, dome_samples=16, edge_samples=7, cache=CacheSettings(noise=0.03, most_reach=24.0)
+        ),
     ),
     "cached 2": _cached(
         65_536,
         64,
         4,
         GatherSettings(
-            1, light_samples=1, edge_samples=15, cache=CacheSettings(noise=0.02, most_reach=24.0, coverage=0.8)
+            1,
+            light_samples=1,
+            dome_samples=32,
+            edge_samples=15,
+            cache=CacheSettings(noise=0.02, most_reach=24.0, coverage=0.8),
         ),
     ),
     "cached 3": _cached(
-        65_536, 128, 8, GatherSettings(2, light_samples=2, edge_samples=14, cache=CacheSettings(noise=0.0125))
+        65_536,
+        128,
+        8,
+        GatherSettings(2, light_samples=2, dome_samples=16, edge_samples=14, cache=CacheSettings(noise=0.0125)),
     ),
     "cached 4": _cached(
         131_072,
@@ -67,6 +81,7 @@ EFFORTS: dict[str, RenderEffort] = {
         GatherSettings(
             4,
             light_samples=2,
+            dome_samples=16,
             edge_samples=28,
             cache=CacheSettings(n_theta=16, noise=0.006, least_reach=1.5, most_reach=8.0, coverage=0.8),
         ),
