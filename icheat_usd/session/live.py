@@ -264,7 +264,10 @@ class LiveSession(LiveAuthoring):
         """Parameters of an edit's operation, at all its keys."""
         with self._changing() as state:
             path = self._edit(edit)
-            self._do(f"parameters {path}", state.with_parameters(path, plain_values(values)))
+            changed = state.with_parameters(path, plain_values(values))
+            # A muted edit is bound only when it takes part again, too late to say what is wrong.
+            changed.check_parameters(path, self._frames.stack_of(self._frames.here()))
+            self._do(f"parameters {path}", changed)
 
     def mute(self, edit: str, muted: bool = True) -> None:
         """Mute an edit, or let it take part again."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from icheat_usd.edits import operations
 from icheat_usd.edits.model import Blend, Edit, EditStack, KeyedPayload, Payload, SurfaceMask, Value
 from icheat_usd.errors import EditError
 from icheat_usd.scene import F32, F64, LightKind
@@ -75,6 +76,22 @@ class LiveState:
     def with_parameters(self, path: str, values: Mapping[str, Value]) -> LiveState:
         known = self.edits.get(path, EditChange()).parameters
         return self.with_edit(path, parameters=MappingProxyType({**known, **values}))
+
+    def check_parameters(self, path: str, stack: EditStack) -> None:
+        """See whether the operation of an edit takes its parameters.
+
+        Raises
+        ------
+        EditError
+            It does not.
+        """
+        edit = next(edit for edit in self.laid_over(stack).edits if edit.path == path)
+        given = [(edit.operation, edit.parameters)]
+        payloads = [key.payload for key in edit.keys if key.payload is not None]
+        for name, parameters in [(one.operation, one.parameters) for one in payloads] or given:
+            operation = operations.find(name)
+            if operation is not None:
+                operation.complete(parameters, path)
 
     def laid_over(self, stack: EditStack) -> EditStack:
         """The stack as the stage has it, with these changes."""

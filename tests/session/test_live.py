@@ -186,6 +186,24 @@ def test_order_decides_where_edits_do_not_commute(stage: Path) -> None:
         np.testing.assert_array_equal(live.frame(), one)
 
 
+def test_a_muted_edit_refuses_what_its_operation_would(stage: Path) -> None:
+    with open_live(stage) as live:
+        for muted in (False, True):
+            live.mute("dim", muted)
+            before = live.state
+            for values, reason in (
+                ({"gain": 1e48}, "'gain' is 1e"),
+                ({"gain": "much"}, "'gain'"),
+                ({"hue": 1.0}, "hue"),
+            ):
+                with pytest.raises(EditError, match=reason):
+                    live.set_parameters("dim", **values)
+            assert live.state is before
+        live.set_parameters("dim", gain=0.25)
+        live.mute("dim", False)
+        assert live.stack.edits[-1].parameters["gain"] == 0.25
+
+
 def test_commit_writes_what_is_shown_and_can_be_undone(stage: Path) -> None:
     with open_live(stage) as live:
         live.wait("rest")
