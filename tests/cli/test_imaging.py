@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -17,6 +16,7 @@ from icheat_usd.cli import main, sequence
 from icheat_usd.image.exr import read_exr
 from icheat_usd.resources import resource_path
 from icheat_usd.session import GatherSettings
+from tests.cli.interruptible import start
 
 BOX = str(resource_path("sample_stages/cornell_box/shot.usda"))
 ANIMATED = str(resource_path("sample_stages/animated_room/shot.usda"))
@@ -74,7 +74,7 @@ def test_an_interrupted_render_leaves_nothing_behind(tmp_path: Path) -> None:
     # Minutes of work, in steps that are short on one core, too: what is being computed ends before anything is stopped.
     work = ["--width", "160", "--height", "120", "--samples", "4096"]
     arguments = [sys.executable, "-m", "icheat_usd", "render", BOX, "-o", str(out), *work]
-    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
+    process = start(arguments)
     assert process.stderr is not None
     # The first line of progress says that work is under way.
     started = process.stderr.readline()

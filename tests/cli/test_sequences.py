@@ -6,7 +6,6 @@ import gc
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 import weakref
@@ -21,6 +20,7 @@ from icheat_usd.image.exr import read_exr
 from icheat_usd.image.png import read_text
 from icheat_usd.session import Session
 from icheat_usd.session.layer_names import FAMILIES, LAYERS
+from tests.cli.interruptible import start
 from tests.cli.sequence_stage import QUICK, STAGE, make_stage
 
 
@@ -247,7 +247,7 @@ def test_an_interrupted_sequence_keeps_its_finished_frames(tmp_path: Path) -> No
     shot = make_stage(tmp_path, STAGE.replace("(16, 12)", "(64, 48)").replace(', 9: "invisible"', ""))
     pattern = str(tmp_path / "f.####.exr")
     command = [sys.executable, "-m", "icheat_usd", "render", str(shot), "--frames", "1:200", "-o", pattern, *QUICK]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = start(command)
     assert process.stdout is not None
     process.stdout.readline()
     time.sleep(0.1)
