@@ -67,13 +67,10 @@ def trace_hemisphere_to_cells(
     seed: int,
 ) -> GatherRays | CellRays:
     """`trace_hemisphere`, for callers that want cells first."""
-    if tracer.compiled() is None:
-        return trace_hemisphere(snapshot, tracer, points, stream, n_rays, seed)
     origins, directions = _hemisphere(snapshot, points, stream, n_rays, seed)
     reflectance = np.repeat(nonzero_rows(directions)[:, None], 3, axis=1).astype(np.float32)
     rays = trace_to_cells(snapshot, tracer, gather, origins, directions, reflectance, int(hash_combine(seed, 1)))
-    assert rays is not None
-    return rays
+    return trace_hemisphere(snapshot, tracer, points, stream, n_rays, seed) if rays is None else rays
 
 
 def _hemisphere(snapshot: SceneSnapshot, points: SurfacePoints, stream: I64, n_rays: int, seed: int) -> tuple[F32, F32]:
