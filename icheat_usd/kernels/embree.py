@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 
+#: Floats of a packet, 22 rows of 16, as RTCRayHit16 has them. Shadow rays need room for the fields of a hit, too: where
+#: the processor has no AVX-512, rtcOccluded16 reads them and writes them back, behind the end of an RTCRay16. Whatever
+#: another thread has there meanwhile would be undone.
+PACKET = 22 * 16
 CHUNK = 1024  # rays per buffer: enough to hide its allocation, few enough to balance threads
 _INVALID = np.uint32(0xFFFFFFFF)
 
@@ -150,10 +154,10 @@ def intersect_packets(
     """Nearest hits in packets of 16 successive rays; `t_max` has n entries or one for all."""
     n = origins.shape[0]
     for chunk in prange((n + CHUNK - 1) // CHUNK):
-        storage = np.empty(24 * 16 + 32, np.float32)
+        storage = np.empty(PACKET + 32, np.float32)
         shift = np.int64((-storage.ctypes.data % 64) // 4)
         valid = storage[shift : shift + 16].view(np.int32)
-        rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
+        rays = storage[shift + 16 : shift + 16 + PACKET].reshape(22, 16)
         words = rays.view(np.uint32)
         for first in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK), 16):
             count = min(16, n - first)
@@ -205,10 +209,10 @@ def occluded_packets(
     """Whether anything is hit, in packets of 16 successive rays; `t_max` has n entries or one for all."""
     n = origins.shape[0]
     for chunk in prange((n + CHUNK - 1) // CHUNK):
-        storage = np.empty(13 * 16 + 16, np.float32)
+        storage = np.empty(PACKET + 32, np.float32)
         shift = np.int64((-storage.ctypes.data % 64) // 4)
         valid = storage[shift : shift + 16].view(np.int32)
-        rays = storage[shift + 16 : shift + 16 + 12 * 16].reshape(12, 16)
+        rays = storage[shift + 16 : shift + 16 + PACKET].reshape(22, 16)
         words = rays.view(np.uint32)
         for first in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK), 16):
             count = min(16, n - first)

@@ -15,7 +15,7 @@ from icheat_usd.kernels.cell_map import (
     square_at,
     unit_normal,
 )
-from icheat_usd.kernels.embree import call_1, call_packet
+from icheat_usd.kernels.embree import PACKET, call_1, call_packet
 from icheat_usd.kernels.fetch import fetch
 from icheat_usd.kernels.locate import nearest_sample
 
@@ -29,11 +29,11 @@ _SIDE, _SQUARE, _LISTED, _ROWS = 3, 4, 5, 6  # and what it keeps in others
 @kernel
 def make_packet():  # type: ignore[no-untyped-def]
     """Room for 16 rays as `trace_16` wants them: which count, their floats, the same as words, and those of one ray."""
-    storage = np.zeros(24 * 16 + 16 + 64, np.float32)
+    storage = np.zeros(PACKET + 64, np.float32)
     shift = np.int64((-storage.ctypes.data % 64) // 4)
     valid = storage[shift : shift + 16].view(np.int32)
-    rays = storage[shift + 16 : shift + 16 + 22 * 16].reshape(22, 16)
-    single = storage[shift + 23 * 16 : shift + 23 * 16 + 24]
+    rays = storage[shift + 16 : shift + 16 + PACKET].reshape(22, 16)
+    single = storage[shift + 16 + PACKET : shift + 40 + PACKET]
     return valid, rays, rays.view(np.uint32), single, single.view(np.uint32)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.embree import call_packet
+from icheat_usd.kernels.embree import PACKET, call_packet
 from icheat_usd.kernels.lanes import minus, where_above
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
 from icheat_usd.kernels.shadow_lanes import CANDIDATE, RUN, look, shine
@@ -63,7 +63,7 @@ def is_turned_away(bounds: np.ndarray, light: np.ndarray, distant: bool) -> bool
 
 @kernel
 def _prepare_packet(rays: np.ndarray) -> None:
-    """What all packets of shadow rays (12, 16) have in common, which tracing leaves as it is."""
+    """What all packets of shadow rays (22, 16) have in common, which tracing leaves as it is."""
     words = rays.view(np.uint32)
     for lane in range(16):
         rays[3, lane] = _ZERO
@@ -241,12 +241,14 @@ def _light_runs(
     """`light_places` for those runs that are `wanted` from number `first` up to `last`."""
     n, candidates, width = last - first, points.shape[0], points.shape[2]
     n_found, n_room = n * _FOUND * RUN, max(candidates * CANDIDATE, 32)
-    storage = np.empty(n_found + 13 * 16 + n_room + 16, np.float32)
+    storage = np.empty(n_found + PACKET + 16 + n_room + 16, np.float32)
     begin = (-address_of(storage) % 64) // 4
     found = storage[begin : begin + n_found].reshape(n, _FOUND, RUN)
     begin += n_found
-    rays, valid = storage[begin : begin + 192].reshape(12, 16), storage[begin + 192 : begin + 208].view(np.int32)
-    room = address_of(storage) + (begin + 208) * 4
+    rays = storage[begin : begin + PACKET].reshape(22, 16)
+    begin += PACKET
+    valid = storage[begin : begin + 16].view(np.int32)
+    room = address_of(storage) + (begin + 16) * 4
     chosen, state = np.empty((n, RUN), np.int32), np.empty((n, RUN), np.int32)
     runs = np.empty(n, np.int64)
     numbers = np.empty(RUN, np.float32)

@@ -11,7 +11,7 @@ from numba import prange
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.bsdf import ggx_density, lobe_alpha, lobe_cosines, smith_lambda, specular_terms
 from icheat_usd.kernels.dome_rays import DISTANCE, PDF, RADIANCE
-from icheat_usd.kernels.embree import call_1, call_packet
+from icheat_usd.kernels.embree import PACKET, call_1, call_packet
 from icheat_usd.kernels.light_rays import ask_rays, find_rays, make_asked
 from icheat_usd.kernels.lights import light_shape
 from icheat_usd.kernels.simd import address_of
@@ -68,11 +68,11 @@ def _add_to_chunk(  # type: ignore[no-untyped-def]
     first, end, trace, lights, textures, tables, guide, light, points, instance, start, to_eye, draws, n_samples, seed,
     weights, out, extremes,
 ):  # fmt: skip
-    storage = np.zeros(13 * 16 + 16 + 64, np.float32)
+    storage = np.zeros(PACKET + 48, np.float32)
     shift = (-address_of(storage) % 64) // 4
     valid = storage[shift : shift + 16].view(np.int32)
-    rays = storage[shift + 16 : shift + 16 + 12 * 16].reshape(12, 16)
-    single = storage[shift + 13 * 16 : shift + 13 * 16 + 16]
+    rays = storage[shift + 16 : shift + 16 + PACKET].reshape(22, 16)
+    single = storage[shift + 16 + PACKET : shift + 32 + PACKET]
     owner, value, brought = np.empty(16, np.int64), np.empty((16, 3), np.float32), np.empty(16, np.float32)
     total = np.zeros((end - first, 3), np.float64)
     shape = light_shape(lights, textures, tables, light)
