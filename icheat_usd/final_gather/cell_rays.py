@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icheat_usd.kernels import cell_rays as kernels
 from icheat_usd.kernels.packets import DETOUR
 from icheat_usd.materials import empty_points, shade_hits, take_points
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, I32, I64, Hits, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces
+from icheat_usd.transport.cell_paths import first_cells
 from icheat_usd.transport.rays import routed_triangles
 
 
@@ -65,31 +65,7 @@ def trace_to_cells(
     trace = tracer.compiled()
     if trace is None:
         return None
-    geometry, locator = snapshot.geometry, gather.locator
-    n = len(origins)
-    cell = np.empty(n, np.int32)
-    hits = Hits(
-        distance=np.empty(n, np.float32),
-        instance=np.empty(n, np.int32),
-        triangle=np.empty(n, np.int32),
-        u=np.empty(n, np.float32),
-        v=np.empty(n, np.float32),
-    )
-    kernels.trace_to_cells(
-        trace,
-        gather.hit_cells.table(geometry, n),
-        locator.table,
-        locator.depth,
-        geometry.points,
-        geometry.instance_to_world,
-        geometry.instance_to_object,
-        routed_triangles(snapshot),
-        origins,
-        directions,
-        reflectance,
-        cell,
-        hits,
-    )
+    cell, hits = first_cells(snapshot, trace, gather, routed_triangles(snapshot), origins, directions, reflectance)
     detour, detour_ends, way = np.flatnonzero(cell == DETOUR), empty_points(0), np.empty((0, 3), np.float32)
     if len(detour):
         rays = origins[detour], directions[detour]

@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
+
+from icheat_usd.kernels._jit import kernel, parallel_kernel
 
 ENTRIES = 4  # of a group
 
@@ -40,47 +43,92 @@ def film_table(
     n_view = len(indptr) - 1
     if not len(tints):
         tints = np.zeros((1, n_view, 3), np.float32)
-    counts = np.diff(indptr)
-    shown = (tints != 0).any(axis=2)
-    # Groups of a sample: of its first lobe, first; of lobes that it does not show, none.
-    groups = np.where(shown, np.maximum(-(-counts // ENTRIES), 1), 0)
-    groups[0, ~shown.any(axis=0)] = 1
-    view = np.repeat(np.tile(np.arange(n_view, dtype=np.int32), len(tints)), groups.ravel())
-    lobe = np.repeat(np.repeat(np.arange(len(tints), dtype=np.uint8), n_view), groups.ravel())
-    ends = np.cumsum(groups.ravel())
-    rank = np.arange(len(view)) - np.repeat(ends - groups.ravel(), groups.ravel())
-    order = np.argsort(view, kind="stable")
-    view, lobe, rank = view[order], lobe[order], rank[order]
-    row, weight = _entries(indptr, indices, weights, view, ENTRIES * rank)
-    tint = np.zeros((len(view), 4), np.float32)
-    tint[:, :3] = tints[lobe, view]
-    is_first = np.concatenate([[True], view[1:] != view[:-1]])[: len(view)]
-    first, more = np.flatnonzero(is_first), np.flatnonzero(~is_first)
-    return FilmTable(
-        row[first],
-        weight[first],
-        tint[first],
-        lobe[first],
-        view[more],
-        row[more],
-        weight[more],
-        tint[more],
-        lobe[more],
+    end = np.zeros(n_view + 1, np.int64)
+    _count_more(indptr, tints, end[1:])
+    np.cumsum(end, out=end)
+    n_more = int(end[-1])
+    table = FilmTable(
+        np.empty((n_view, ENTRIES), np.int32),
+        np.empty((n_view, ENTRIES), np.float32),
+        np.zeros((n_view, 4), np.float32),
+        np.empty(n_view, np.uint8),
+        np.empty(n_more, np.int32),
+        np.empty((n_more, ENTRIES), np.int32),
+        np.empty((n_more, ENTRIES), np.float32),
+        np.zeros((n_more, 4), np.float32),
+        np.empty(n_more, np.uint8),
     )
+    _fill_table(indptr, indices, weights, tints, end, *table)
+    return table
 
 
-def _entries(
-    indptr: NDArray[np.int64],
-    indices: NDArray[np.int32],
-    weights: NDArray[np.float32],
-    view: NDArray[np.int32],
-    skipped: NDArray[np.int64],
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Four entries of each of some samples, behind those `skipped`."""
-    row, weight = np.zeros((len(view), ENTRIES), np.int32), np.zeros((len(view), ENTRIES), np.float32)
-    begin, end = indptr[view] + skipped, indptr[view + 1]
+@kernel
+def _is_shown(tints, lobe, v):  # type: ignore[no-untyped-def]
+    zero = np.float32(0)
+    return tints[lobe, v, 0] != zero or tints[lobe, v, 1] != zero or tints[lobe, v, 2] != zero
+
+
+@parallel_kernel
+def _count_more(indptr, tints, count):  # type: ignore[no-untyped-def]
+    """Groups of each sample behind its first one: those of lobes that it shows."""
+    for v in prange(len(count)):
+        of_lobe = max((indptr[v + 1] - indptr[v] + ENTRIES - 1) // ENTRIES, 1)
+        total = 0
+        for lobe in range(tints.shape[0]):
+            if _is_shown(tints, lobe, v):
+                total += of_lobe
+        count[v] = max(total - 1, 0)
+
+
+@kernel
+def _fill_group(indptr, indices, weights, tints, v, lobe, skipped, row, weight, tint):  # type: ignore[no-untyped-def]
+    """Up to four entries of a sample, behind those `skipped`, and its tint."""
+    begin, end = indptr[v] + skipped, indptr[v + 1]
     for k in range(ENTRIES):
-        has = np.flatnonzero(begin + k < end)
-        row[:, k] = row[:, 0]  # already read: a row elsewhere would cost a cache line
-        row[has, k], weight[has, k] = np.take(indices, begin[has] + k), np.take(weights, begin[has] + k)
-    return row, weight
+        has = begin + k < end
+        # Else one that is read anyway: a row elsewhere would cost a cache line.
+        row[k] = indices[begin + k] if has else (row[0] if k > 0 else np.int32(0))
+        weight[k] = weights[begin + k] if has else np.float32(0)
+    for c in range(3):
+        tint[c] = tints[lobe, v, c]
+
+
+@parallel_kernel
+def _fill_table(  # type: ignore[no-untyped-def]
+    indptr,
+    indices,
+    weights,
+    tints,
+    more_begin,
+    row,
+    weight,
+    tint,
+    lobe,
+    more_view,
+    more_row,
+    more_weight,
+    more_tint,
+    more_lobe,
+):
+    """The columns of a `FilmTable`; further groups of sample v begin at ``more_begin[v]``."""
+    for index in prange(len(lobe)):
+        v = np.int64(index)
+        more = more_begin[v]
+        is_first = True
+        for of in range(tints.shape[0]):
+            if not _is_shown(tints, of, v):
+                continue
+            for skipped in range(0, max(indptr[v + 1] - indptr[v], 1), ENTRIES):
+                if is_first:
+                    _fill_group(indptr, indices, weights, tints, v, of, skipped, row[v], weight[v], tint[v])
+                    lobe[v] = of
+                    is_first = False
+                    continue
+                _fill_group(
+                    indptr, indices, weights, tints, v, of, skipped, more_row[more], more_weight[more], more_tint[more]
+                )
+                more_view[more], more_lobe[more] = v, of
+                more += 1
+        if is_first:
+            _fill_group(indptr, indices, weights, tints, v, 0, 0, row[v], weight[v], tint[v])
+            lobe[v] = 0

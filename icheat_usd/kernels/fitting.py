@@ -11,6 +11,7 @@ MOST = 12  # records that one sample is fitted with
 _STEPS = 40  # of coordinate descent
 _SAME_WEIGHT = 10.0  # strictness of the weights' sum being 1, in units of the mean curvature
 _LEAST_COSINE = np.float32(0.3)  # between the normals of a sample and a record
+_LANES, _BLOCK = 32, 128  # that samples are shared out to, and at a time
 _TURN = np.float32(16.0)  # square of the pixels that a turn by a radian is as far as
 
 
@@ -254,30 +255,34 @@ def fit_weights(  # type: ignore[no-untyped-def]
     count : (n,) int64, out_record : (n, most) int32, out_weight : (n, most) float32
         Out.
     """
-    for q in prange(len(samples)):
-        count[q] = _fit_one(
-            samples[q],
-            indptr,
-            indices,
-            weights,
-            pixel,
-            shape,
-            position,
-            normal,
-            instance,
-            extent,
-            bucket_side,
-            bucket_begin,
-            bucket_record,
-            record_view,
-            response,
-            gloss_of,
-            gloss,
-            tint,
-            light,
-            prior,
-            most,
-            least,
-            out_record[q],
-            out_weight[q],
-        )
+    n = len(samples)
+    for lane in prange(_LANES):
+        # Blocks here and there: hard samples lie close together.
+        for first in range(lane * _BLOCK, n, _LANES * _BLOCK):
+            for q in range(first, min(n, first + _BLOCK)):
+                count[q] = _fit_one(
+                    samples[q],
+                    indptr,
+                    indices,
+                    weights,
+                    pixel,
+                    shape,
+                    position,
+                    normal,
+                    instance,
+                    extent,
+                    bucket_side,
+                    bucket_begin,
+                    bucket_record,
+                    record_view,
+                    response,
+                    gloss_of,
+                    gloss,
+                    tint,
+                    light,
+                    prior,
+                    most,
+                    least,
+                    out_record[q],
+                    out_weight[q],
+                )

@@ -57,12 +57,12 @@ def pack_rows(counts, begin, index, weight, out_index, out_weight):  # type: ign
 
 
 @parallel_kernel
-def place_rows(indptr, begin, index, weight, out_index, out_weight):  # type: ignore[no-untyped-def]
-    """Copy row r of a packed matrix to ``begin[r]`` of another."""
+def copy_rows(source, count, begin, index, weight, out_index, out_weight):  # type: ignore[no-untyped-def]
+    """Copy ``count[r]`` entries from ``source[r]`` of a packed matrix to ``begin[r]`` of another."""
     for r in prange(len(begin)):
-        for e in range(indptr[r + 1] - indptr[r]):
-            out_index[begin[r] + e] = index[indptr[r] + e]
-            out_weight[begin[r] + e] = weight[indptr[r] + e]
+        for e in range(count[r]):
+            out_index[begin[r] + e] = index[source[r] + e]
+            out_weight[begin[r] + e] = weight[source[r] + e]
 
 
 @parallel_kernel

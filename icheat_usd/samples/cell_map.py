@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,19 +39,21 @@ class HitCells:
         self._locator = locator
         self._asked = 0
         self._map: CellMap | None = None
+        self._lock = threading.Lock()
 
     def table(self, geometry: Geometry, n_hits: int) -> kernels.CellTable:
         """What to look up `n_hits` hits by; without entries while there is no map."""
-        self._asked += n_hits
-        if self._map is None:
-            triangles = min(int(np.diff(geometry.mesh_begin)[geometry.instance_mesh].sum()), MOST_PLACED)
-            samples = len(self._locator.table.sample)
-            if self._asked < _WORTH_PER_TRIANGLE * triangles + _WORTH_PER_SAMPLE * samples:
-                place = np.full(len(geometry.instance_mesh), kernels.NO_FACES)
-                nothing = np.zeros(0, np.int32)
-                return kernels.CellTable(place, np.zeros((0, 3), np.int32), nothing, nothing)
-            self._map = build_cell_map(geometry, self._locator)
-        return self._map.table
+        with self._lock:
+            self._asked += n_hits
+            if self._map is None:
+                triangles = min(int(np.diff(geometry.mesh_begin)[geometry.instance_mesh].sum()), MOST_PLACED)
+                samples = len(self._locator.table.sample)
+                if self._asked < _WORTH_PER_TRIANGLE * triangles + _WORTH_PER_SAMPLE * samples:
+                    place = np.full(len(geometry.instance_mesh), kernels.NO_FACES)
+                    nothing = np.zeros(0, np.int32)
+                    return kernels.CellTable(place, np.zeros((0, 3), np.int32), nothing, nothing)
+                self._map = build_cell_map(geometry, self._locator)
+            return self._map.table
 
 
 def build_cell_map(geometry: Geometry, locator: Locator, *, fineness: float = FINENESS) -> CellMap:

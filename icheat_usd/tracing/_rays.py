@@ -24,3 +24,10 @@ def checked_rays(origins: ArrayLike, directions: ArrayLike, t_max: ArrayLike | N
     if limits.shape not in ((1,), (len(origin_rows),)):
         raise ValueError(f"t_max needs one value or one per ray ({len(origin_rows)}); got {limits.shape}")
     return origin_rows, direction_rows, limits
+
+
+def unit_directions(directions: F32) -> F32:
+    """Directions (n, 3) of length 1; those without length stay zero."""
+    length = np.linalg.norm(directions.astype(np.float64), axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(length > 0, directions / length, 0).astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 
 from icheat_usd.materials import shade_hits, take_points
 from icheat_usd.scene import F32, I32, Bool, DeltaKind, Hits, Materials, SceneSnapshot, SurfacePoints, Texture
-from icheat_usd.tracing._rays import checked_rays
+from icheat_usd.tracing._rays import checked_rays, unit_directions
 from icheat_usd.tracing.protocol import Tracer, spawn_points
 
 #: A shadow ray through more layers than this counts as blocked.
@@ -78,9 +78,7 @@ def first_surfaces(
     from icheat_usd.kernels import tracing
 
     origins, directions, _ = checked_rays(origins, directions, None)
-    length = np.linalg.norm(directions.astype(np.float64), axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ray_direction = np.where(length > 0, directions / length, 0).astype(np.float32)
+    ray_direction = unit_directions(directions)
     n = len(origins)
     path = np.arange(n, dtype=np.int32)
     counter = path if counters is None else np.require(counters, np.int32, ["C", "W"])

@@ -52,7 +52,9 @@ def allot_rays(
     seen, variances = [], []
     for k, (rows, tint) in enumerate(zip(lobes, tints, strict=True)):
         products = rows.matmul(lights)
-        image += tint[:, None] * spread.matmul(products)
+        part = spread.matmul(products)
+        part *= tint[:, None]  # in place: there are many lights, and new memory costs as much as the product
+        image += part
         # Rays of a specular row weigh about as much as each other, though not 1.
         second = rows.matmul(lights * lights) * (rows.row_sums()[:, None] if k else 1)
         variances.append(np.maximum(second - products * products, 0))

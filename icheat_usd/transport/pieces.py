@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Protocol, TypeVar, cast
 
+from icheat_usd.kernels.workers import overlapping
+from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import I64
 from icheat_usd.transport.rays import MeasuredRows
 from icheat_usd.transport.sparse import SparseRows, concatenate_rows
 
 Piece = TypeVar("Piece")
 
-#: Some seconds of work, and some ten megabytes.
-_RAYS_PER_PIECE = 1 << 21
+#: A fifth of a second of work, and some megabytes.
+_RAYS_PER_PIECE = 1 << 19
 
 
 class PartStore(Protocol):
@@ -25,16 +28,27 @@ class PartStore(Protocol):
 
 
 class Pieces:
-    """Pieces of work, always the same ones in the same order, each found in a store or made and kept there."""
+    """Pieces of work, always the same ones in the same order, each found in a store or made and kept there.
 
-    def __init__(self, store: PartStore | None = None, rays_per_piece: int = _RAYS_PER_PIECE) -> None:
-        self._store, self._rays = store, rays_per_piece
+    Two are made at a time where kernels may overlap; they must not depend on each other.
+    """
+
+    def __init__(
+        self, store: PartStore | None = None, progress: Progress = silent, rays_per_piece: int = _RAYS_PER_PIECE
+    ) -> None:
+        self._store, self._progress, self._rays = store, progress, rays_per_piece
         self._n = 0
 
-    def get(self, make: Callable[[], Piece]) -> Piece:
-        """The next piece."""
-        name = f"piece-{self._n:05d}"
-        self._n += 1
+    def each(self, make: Callable[[I64], Piece], parts: list[I64], step: str) -> Iterator[Piece]:
+        """The next pieces, made of some samples each. All are to be asked for."""
+        makers = [partial(self._one, f"piece-{self._n + i:05d}", partial(make, part)) for i, part in enumerate(parts)]
+        self._n += len(parts)
+        self._progress(step, 0.0)
+        for done, piece in enumerate(overlapping(makers), 1):
+            yield piece
+            self._progress(step, done / len(parts))
+
+    def _one(self, name: str, make: Callable[[], Piece]) -> Piece:
         found = None if self._store is None else self._store.load(name)
         if found is not None:
             return cast(Piece, found)
@@ -43,29 +57,28 @@ class Pieces:
             self._store.save(name, made)
         return made
 
-    def measured(self, samples: I64, n_rays: int, make: Callable[[I64], MeasuredRows]) -> MeasuredRows:
+    def measured(self, make: Callable[[I64], MeasuredRows], samples: I64, n_rays: int, step: str) -> MeasuredRows:
         """Rows of some samples, which must not depend on how these are divided.
 
         As near as `RowBuilder.measure` holds to that: a build that goes on is divided as it was, to the same bits.
         """
-        found = self._divided(samples, n_rays, make)
+        found = list(self.each(make, self._divided(samples, n_rays), step))
         if len(found) == 1:
             return found[0]
         cells = concatenate_rows([part.cells for part in found], found[0].cells.n_columns)
         return MeasuredRows(cells, n_rays)
 
     def both(
-        self, samples: I64, n_rays: int, make: Callable[[I64], tuple[SparseRows, SparseRows]]
+        self, make: Callable[[I64], tuple[SparseRows, SparseRows]], samples: I64, n_rays: int, step: str
     ) -> tuple[SparseRows, SparseRows]:
         """The same for pairs of rows with the same columns, which they share in memory."""
-        found = self._divided(samples, n_rays, make)
+        found = list(self.each(make, self._divided(samples, n_rays), step))
         if len(found) == 1:
             return found[0]
         n_columns = found[0][0].n_columns
         base, edge = (concatenate_rows([part[i] for part in found], n_columns) for i in (0, 1))
         return base, SparseRows(base.indptr, base.indices, edge.weights, n_columns)
 
-    def _divided(self, samples: I64, n_rays: int, make: Callable[[I64], Piece]) -> list[Piece]:
+    def _divided(self, samples: I64, n_rays: int) -> list[I64]:
         step = max(1, self._rays // max(n_rays, 1))
-        parts = [samples[first : first + step] for first in range(0, max(len(samples), 1), step)]
-        return [self.get(lambda part=part: make(part)) for part in parts]  # type: ignore[misc]
+        return [samples[first : first + step] for first in range(0, max(len(samples), 1), step)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
@@ -29,10 +28,11 @@ _SURVEY_RAYS = 64
 #: Numbers of the survey that are held in memory, though it has some lights at least.
 _SURVEYED_NUMBERS, _FEWEST_LIGHTS = 1 << 26, 48
 _STRONG = 0.2  # reflectance: what reflects less gets no records of its own for that
-_SURVEYED_AT_ONCE = 1 << 15  # samples, whose rows are held in memory
+_SURVEYED_AT_ONCE = 1 << 13  # samples, whose rows are held in memory
 _FIRST_RAYS = 256  # of each record by itself, by which the others are allotted
 _GROWTH = 4  # of the rays from one transport to the next
 _TILE = (8, 16)  # pixels: places whose rays are traced together
+_DIFFUSE_STEP, _GLOSSY_STEP = "gather rays", "glossy gather rays"
 _LOBES = ("diffuse", "specular_base", "specular_edge")
 
 
@@ -92,14 +92,12 @@ def build_transports(
     colours = view.points.albedo, view.points.specular, view.points.specular_edge
     tint = np.stack([_scalar(colour) * share for colour in colours])
     placed: list[list[SparseRows]] = [[], [], []]
-    pieces = Pieces(parts)
+    pieces = Pieces(parts, progress)
 
     def trace(samples: I64, stream: I64, first_ray: int, n_rays: int, of_rays: int) -> MeasuredRows:
         points = take_points(view.points, samples)
         one_each = np.arange(len(samples) + 1, dtype=np.int64)
-        return builder.measure(
-            points, one_each, stream, n_rays, 0, progress, "gather rays", first_ray=first_ray, of_rays=of_rays
-        )
+        return builder.measure(points, one_each, stream, n_rays, 0, first_ray=first_ray, of_rays=of_rays)
 
     def trace_specular(samples: I64, stream: I64, counts: I64) -> tuple[SparseRows, SparseRows]:
         points = take_points(view.points, samples)
@@ -107,19 +105,20 @@ def build_transports(
         if not len(glossy):
             nothing = SparseRows.empty(len(samples), gather.n)
             return nothing, nothing
-        return builder.specular_rows(points, view.to_eye[samples], stream, glossy, counts[glossy], progress)
+        return builder.specular_rows(points, view.to_eye[samples], stream, glossy, counts[glossy], silent)
 
     def rows_of(samples: I64, stream: I64, first_ray: int, n_rays: int) -> MeasuredRows:
         def make(rows: I64) -> MeasuredRows:
             return trace(samples[rows], stream[rows], first_ray, n_rays, first_ray + n_rays)
 
-        return pieces.measured(np.arange(len(samples)), n_rays, make)
+        return pieces.measured(make, np.arange(len(samples)), n_rays, _DIFFUSE_STEP)
 
     def specular(samples: I64, stream: I64, counts: I64) -> list[SparseRows]:
         def make(rows: I64) -> tuple[SparseRows, SparseRows]:
             return trace_specular(samples[rows], stream[rows], counts[rows])
 
-        return list(pieces.both(np.arange(len(samples)), int(counts.mean()) + 1 if len(counts) else 1, make))
+        n_rays = int(counts.mean()) + 1 if len(counts) else 1
+        return list(pieces.both(make, np.arange(len(samples)), n_rays, _GLOSSY_STEP))
 
     n_surveyed = max(_FEWEST_LIGHTS, _SURVEYED_NUMBERS // (2 * view.n))
     survey_lights = np.ascontiguousarray(lights[:, :n_surveyed])
@@ -137,13 +136,16 @@ def build_transports(
     def survey() -> Survey:
         """The light at every view sample."""
         order = _in_image_tiles(view, np.arange(view.n))
-        glossy = order[is_glossy(view.points)[order]]
-        diffuse = np.concatenate([pieces.get(partial(look, samples)) for samples in _chunks(order)])
-        reflected = np.concatenate([pieces.get(partial(look_specular, samples)) for samples in _chunks(glossy)])
-        by_sample = np.empty_like(diffuse)
-        by_sample[order] = diffuse
-        ascending = np.argsort(glossy)
-        return Survey(by_sample, glossy[ascending], reflected[ascending])
+        is_found = is_glossy(view.points)
+        glossy = np.flatnonzero(is_found)
+        diffuse, reflected = (np.empty((n, 2, survey_lights.shape[1]), np.float32) for n in (view.n, len(glossy)))
+        chunks = _chunks(order)
+        for some, light in zip(chunks, pieces.each(look, chunks, _DIFFUSE_STEP), strict=True):
+            diffuse[some] = light
+        chunks = _chunks(order[is_found[order]])
+        for some, light in zip(chunks, pieces.each(look_specular, chunks, _GLOSSY_STEP), strict=True):
+            reflected[np.searchsorted(glossy, some)] = light
+        return Survey(diffuse, glossy, reflected)
 
     def probe(samples: I64) -> F32:
         order = _in_image_tiles(view, samples)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,14 +16,19 @@ from icheat_usd.kernels import transport as kernels
 from icheat_usd.kernels.cell_map import CellTable
 from icheat_usd.kernels.embree import TraceTable
 from icheat_usd.kernels.random import hash_combine
+from icheat_usd.kernels.workers import overlapping
 from icheat_usd.materials import sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, I32, I64, U8, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
-from icheat_usd.transport.sparse import SparseRows, add_shares, concatenate_rows
+from icheat_usd.transport.cell_paths import cells_behind
+from icheat_usd.transport.sparse import SparseRows, add_shares, concatenate_rows, placed_rows
 
-_RAYS_AT_ONCE = 1 << 20
+Chunk = TypeVar("Chunk")
+
+#: A fifth of a second: who interrupts waits for two such chunks.
+_RAYS_AT_ONCE = 1 << 19
 _UNITS = 1024  # of a ray: counts stay whole numbers where mirrors and glass let part of its light through
 #: Of a row that is measured in parts: float32 shares give back counts of units below 2^23.
 MOST_RAYS = (1 << 23) // _UNITS
@@ -141,7 +148,7 @@ class RowBuilder:
             row, ray = np.repeat(np.arange(n), n_rays), np.tile(np.arange(first_ray, first_ray + n_rays), n)
             return _counted(row, *self._ends(part, row, ray), n, self._gather.n)
 
-        units = self._in_chunks(len(stream), n_rays, row_chunk, progress, step)
+        units = concatenate_rows(self._in_chunks(len(stream), n_rays, row_chunk, progress, step), self._gather.n)
         kernels.divide(units.weights, float(_UNITS * n_rays))
         return MeasuredRows(units, n_rays)
 
@@ -242,12 +249,11 @@ class RowBuilder:
         """
         seed = self._seed_for(2)
         counts = n_rays if isinstance(n_rays, np.ndarray) else specular_counts(points, glossy, n_rays)
-        second: list[F32] = []
         parts: list[tuple[I64, SparseRows, F32]] = []
         for rays in np.unique(counts).tolist():
             rows = glossy[counts == rays]
 
-            def row_chunk(first: int, last: int, rows: I64 = rows, rays: int = rays) -> SparseRows:
+            def row_chunk(first: int, last: int, rows: I64 = rows, rays: int = rays) -> tuple[SparseRows, F32]:
                 start = np.repeat(rows[first:last], rays)
                 u = np.empty((len(start), 2), np.float32)
                 kernels.point_sets(seed, stream[rows[first:last]], rays, u)
@@ -258,13 +264,11 @@ class RowBuilder:
                 kernels.ray_counters(seed, stream[rows[first:last]], rays, counter)
                 cell, weight = self._cells(origins, directions, counter, seed)
                 both = np.stack([to_base, to_edge], axis=1) / np.float32(rays)
-                base, edge = self._merge(cell, both if weight is None else both * weight[:, None], rays)
-                second.append(edge)
-                return base
+                return self._merge(cell, both if weight is None else both * weight[:, None], rays)
 
-            base = self._in_chunks(len(rows), rays, row_chunk, progress, "glossy gather rays", _RAYS_AT_ONCE // 4)
-            parts.append((rows, base, np.concatenate(second)))
-            second.clear()
+            chunks = self._in_chunks(len(rows), rays, row_chunk, progress, "glossy gather rays", _RAYS_AT_ONCE // 2)
+            edge = np.concatenate([part for _, part in chunks])
+            parts.append((rows, concatenate_rows([base for base, _ in chunks], self._gather.n), edge))
 
         whole = scatter_rows([(rows, base) for rows, base, _ in parts], len(stream), self._gather.n)
         if len(parts) == 1:
@@ -281,22 +285,24 @@ class RowBuilder:
         self,
         n_rows: int,
         n_rays: int,
-        row_chunk: Callable[[int, int], SparseRows],
+        row_chunk: Callable[[int, int], Chunk],
         progress: Progress,
         step: str,
         rays_at_once: int = _RAYS_AT_ONCE,
-    ) -> SparseRows:
-        parts = []
+    ) -> list[Chunk]:
         at_once = max(1, rays_at_once // n_rays)
+        spans = [(first, min(first + at_once, n_rows)) for first in range(0, n_rows, at_once)]
+        chunks = []
         progress(step, 0.0)
-        for first in range(0, n_rows, at_once):
-            last = min(first + at_once, n_rows)
-            parts.append(row_chunk(first, last))
+        for (_, last), chunk in zip(spans, overlapping([partial(row_chunk, *span) for span in spans]), strict=True):
+            chunks.append(chunk)
             progress(step, last / n_rows)
-        return concatenate_rows(parts, self._gather.n)
+        return chunks
 
     def _cells(self, origins: F32, directions: F32, counters: I32, seed: int) -> tuple[I32, F32 | None]:
         """Cell that each ray ends in and its throughput; None for the throughput where it is 1 for all."""
+        if self._trace_table() is not None:
+            return self._cells_behind(origins, directions, counters, seed)
         hits = self._tracer.intersect(origins, directions)
         cell = np.empty(len(origins), np.int32)
         detour = np.empty(len(origins), np.uint8)
@@ -326,6 +332,12 @@ class RowBuilder:
 
     def _cells_behind(self, origins: F32, directions: F32, counters: I32, seed: int) -> tuple[I32, F32]:
         """Cell at the end of each path over mirrors, glass and holes, and the path's throughput."""
+        trace = self._trace_table()
+        if trace is not None:
+            rays = trace, self._gather, self._route, origins, directions
+            cell, throughput = cells_behind(self._snapshot, *rays, counters, seed, _DETOUR_DEPTH)
+            red, green, blue = throughput.T
+            return cell, (red + green + blue) / np.float32(3)
         ends = first_surfaces(self._snapshot, self._tracer, origins, directions, seed, _DETOUR_DEPTH, counters)
         red, green, blue = ends.throughput.T
         return self._gather.locate(ends.points), (red + green + blue) / np.float32(3)
@@ -360,8 +372,8 @@ class _Rays(NamedTuple):
         return self._replace(point_begin=self.point_begin[first : last + 1], stream=self.stream[first:last])
 
 
-class _Counter:
-    """Zeros that the kernel counts on, some lanes for each thread."""
+class _Counter(threading.local):
+    """Zeros that the kernel counts on, some lanes for each of its workers; of each thread that calls the kernel."""
 
     def __init__(self, n_keys: int) -> None:
         lanes = _LANES_PER_THREAD * gather_kernels.thread_count()
@@ -397,13 +409,9 @@ def _mix(seed: int, value: int) -> int:
 
 def scatter_rows(parts: list[tuple[I64, SparseRows]], n_rows: int, n_columns: int) -> SparseRows:
     """One matrix of parts whose rows belong at given places, ascending in each part; other rows are empty."""
-    counts = np.zeros(n_rows, np.int64)
-    for place, rows in parts:
+    if len(parts) == 1:  # without a copy of it
+        place, rows = parts[0]
+        counts = np.zeros(n_rows, np.int64)
         counts[place] = np.diff(rows.indptr)
-    indptr = np.concatenate([[0], np.cumsum(counts)])
-    if len(parts) == 1:
-        return SparseRows(indptr, parts[0][1].indices, parts[0][1].weights, n_columns)
-    out = SparseRows(indptr, np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32), n_columns)
-    for place, rows in parts:
-        row_kernels.place_rows(rows.indptr, indptr[place], rows.indices, rows.weights, out.indices, out.weights)
-    return out
+        return SparseRows(np.concatenate([[0], np.cumsum(counts)]), rows.indices, rows.weights, n_columns)
+    return placed_rows([(place, rows, np.arange(rows.n_rows)) for place, rows in parts], n_rows, n_columns)

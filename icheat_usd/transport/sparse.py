@@ -124,19 +124,30 @@ def add_shares(a: SparseRows, of_a: float, b: SparseRows, of_b: float, of_sum: f
     return out
 
 
-def select_rows(base: SparseRows, other: SparseRows, rows: I64, of_other: I64) -> SparseRows:
-    """`base` with its `rows` replaced by the rows `of_other` of another matrix, whose width it gets."""
-    count = np.diff(base.indptr)
-    begin = base.indptr[:-1].copy()
-    count[rows] = np.diff(other.indptr)[of_other]
-    begin[rows] = base.n_entries + other.indptr[of_other]
+def placed_rows(parts: list[tuple[I64, SparseRows, I64]], n_rows: int, n_columns: int) -> SparseRows:
+    """One matrix of parts of others: places in it, each named once, a matrix, and its rows that belong there.
+
+    Rows that nothing belongs to are empty.
+    """
+    count = np.zeros(n_rows, np.int64)
+    for place, rows, which in parts:
+        count[place] = rows.indptr[which + 1] - rows.indptr[which]
     indptr = np.concatenate([[0], np.cumsum(count)])
-    source = np.repeat(begin - indptr[:-1], count) + np.arange(indptr[-1])
-    indices = np.concatenate([base.indices, other.indices])[source]
-    weights = np.concatenate([base.weights, other.weights])[source]
-    return SparseRows(indptr, indices, weights, other.n_columns)
+    out = SparseRows(indptr, np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32), n_columns)
+    for place, rows, which in parts:
+        source, begin = rows.indptr[which], indptr[place]
+        kernels.copy_rows(source, count[place], begin, rows.indices, rows.weights, out.indices, out.weights)
+    return out
+
+
+def select_rows(base: SparseRows, other: SparseRows, rows: I64, of_other: I64) -> SparseRows:
+    """`base`, its `rows`, each named once, replaced by the rows `of_other` of another matrix, whose width it gets."""
+    kept = np.ones(base.n_rows, np.bool_)
+    kept[rows] = False
+    left = np.flatnonzero(kept)
+    return placed_rows([(left, base, left), (rows, other, of_other)], base.n_rows, other.n_columns)
 
 
 def take_rows(rows: SparseRows, which: I64) -> SparseRows:
     """Some rows of a matrix, in the order given."""
-    return select_rows(SparseRows.empty(len(which), rows.n_columns), rows, np.arange(len(which)), which)
+    return placed_rows([(np.arange(len(which)), rows, which)], len(which), rows.n_columns)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from icheat_usd.transport import SparseRows
-from icheat_usd.transport.sparse import concatenate_rows
+from icheat_usd.transport.rays import scatter_rows
+from icheat_usd.transport.sparse import concatenate_rows, placed_rows, select_rows, take_rows
 
 
 def random_rows(n_rows: int, n_columns: int, seed: int = 0) -> tuple[SparseRows, np.ndarray]:
@@ -50,3 +51,25 @@ def test_parts_of_a_matrix_stack_up_to_it_again() -> None:
     assert np.array_equal(again.indptr, rows.indptr)
     assert np.array_equal(again.indices, rows.indices)
     assert np.array_equal(again.weights, rows.weights)
+
+
+def dense_of(rows: SparseRows) -> np.ndarray:
+    return rows.matmul(np.eye(rows.n_columns, dtype=np.float32))
+
+
+def test_rows_are_taken_replaced_and_placed() -> None:
+    rows, dense = random_rows(40, 90)
+    other, of_other = random_rows(30, 90, seed=1)
+    which = np.array([3, 39, 3, 20, 0])
+    assert np.array_equal(dense_of(take_rows(rows, which)), dense[which])
+
+    places, of = np.array([1, 0, 39]), np.array([29, 4, 15])
+    expected = dense.copy()
+    expected[places] = of_other[of]
+    assert np.array_equal(dense_of(select_rows(rows, other, places, of)), expected)
+
+    apart = placed_rows([(places, other, of), (np.array([7]), rows, np.array([12]))], 41, 90)
+    expected = np.zeros((41, 90), np.float32)
+    expected[places], expected[7] = of_other[of], dense[12]
+    assert np.array_equal(dense_of(apart), expected)
+    assert np.array_equal(dense_of(scatter_rows([(np.arange(0, 80, 2), rows)], 80, 90))[::2], dense)
