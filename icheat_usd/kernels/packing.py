@@ -220,35 +220,71 @@ def _difference(a, b, of_a, of_b, square, difference, both):  # type: ignore[no-
 
 
 @kernel
-def _invert(matrix):  # type: ignore[no-untyped-def]
-    """Inverse of a symmetric positive definite matrix, by Cholesky's factors; `matrix` is overwritten."""
-    n = len(matrix)
+def _add_to_gram(light, scaled, gram, sums):  # type: ignore[no-untyped-def]
+    """Add ``scaled^T light``, both (m, width), to `gram` (width, width): its blocks on the diagonal and above.
+
+    Four rows by 16 columns stay in registers, in single precision: m is small. `sums` (4, 16) is scratch.
+    """
+    m, width = light.shape
+    step = 4 * width
+    for a in range(0, width, 4):
+        for b in range(a // 16 * 16, width, 16):
+            s0, s1, s2, s3 = zeros(), zeros(), zeros(), zeros()
+            place, factors = address_of(light) + 4 * b, address_of(scaled) + 4 * a
+            for _ in range(m):
+                x = load(place)
+                s0 = multiply_add(load_spread(factors), x, s0)
+                s1 = multiply_add(load_spread(factors + 4), x, s1)
+                s2 = multiply_add(load_spread(factors + 8), x, s2)
+                s3 = multiply_add(load_spread(factors + 12), x, s3)
+                place += step
+                factors += step
+            out = address_of(sums)
+            store(out, s0)
+            store(out + 64, s1)
+            store(out + 128, s2)
+            store(out + 192, s3)
+            for i in range(4):
+                for j in range(16):
+                    gram[a + i, b + j] += sums[i, j]
+
+
+@kernel
+def _solve(matrix, right):  # type: ignore[no-untyped-def]
+    """Solve a symmetric positive definite system for `right` (n, k) by Cholesky's factors, in place.
+
+    Reads the upper triangle of `matrix` (n, n), which is overwritten. All inner loops go along rows.
+    """
+    n, k = right.shape
     for j in range(n):
+        diagonal = np.sqrt(matrix[j, j])
         for i in range(j, n):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = np.sqrt(total) if i == j else total / matrix[j, j]
-    lower = np.zeros((n, n), np.float64)
-    for j in range(n):
-        lower[j, j] = 1.0 / matrix[j, j]
+            matrix[j, i] /= diagonal
         for i in range(j + 1, n):
-            total = 0.0
-            for k in range(j, i):
-                total -= matrix[i, k] * lower[k, j]
-            lower[i, j] = total / matrix[i, i]
-    inverse = np.zeros((n, n), np.float64)
-    for k in range(n):
-        for i in range(k + 1):
-            for j in range(k + 1):
-                inverse[i, j] += lower[k, i] * lower[k, j]
-    return inverse
+            factor = matrix[j, i]
+            for c in range(i, n):
+                matrix[i, c] -= factor * matrix[j, c]
+    for i in range(n):
+        for j in range(i):
+            factor = matrix[j, i]
+            for c in range(k):
+                right[i, c] -= factor * right[j, c]
+        for c in range(k):
+            right[i, c] /= matrix[i, i]
+    for step in range(n):
+        i = n - 1 - step
+        for j in range(i + 1, n):
+            factor = matrix[i, j]
+            for c in range(k):
+                right[i, c] -= factor * right[j, c]
+        for c in range(k):
+            right[i, c] /= matrix[i, i]
 
 
 @kernel
 def _take_lost(first, last, value, light, lost):  # type: ignore[no-untyped-def]
-    """Subtract from `lost` (n, 64) what coefficients ``first:last`` make of each light (n_kept, n)."""
-    for a in range(light.shape[1]):
+    """Subtract from `lost` (n, 64) what coefficients ``first:last`` make of each light (n_kept, n or more)."""
+    for a in range(len(lost)):
         sums = address_of(lost) + _ROW * a
         s0, s1, s2, s3 = load(sums), load(sums + 64), load(sums + 128), load(sums + 192)
         place = address_of(value) + _ROW * first
@@ -299,31 +335,28 @@ def _refit_tile(light, index, value, lost):  # type: ignore[no-untyped-def]
     `lost` (n, 64) is the exact response, and is overwritten.
     """
     n = light.coefficients.shape[1]
-    kept, gram = np.empty((len(index), n), np.float32), np.zeros((n, n), np.float64)
+    width = (n + 15) // 16 * 16  # of whole vectors; what is added is 0
+    kept, gram = np.zeros((len(index), width), np.float32), np.zeros((width, width), np.float64)
     for e in range(len(index)):
         for a in range(n):
             kept[e, a] = light.coefficients[index[e], a]
+    scaled, sums = np.empty((_AT_ONCE, width), np.float32), np.empty((4, 16), np.float32)
     for first in range(0, len(index), _AT_ONCE):
-        _take_lost(first, min(first + _AT_ONCE, len(index)), value, kept, lost)
-    for e in range(len(index)):
-        alone = light.alone[index[e]]
-        inverse = np.float32(1.0) / alone if index[e] > 0 and alone > np.float32(0) else np.float32(0)
-        for a in range(n):
-            factor = np.float64(kept[e, a] * inverse)
-            for b in range(n):
-                gram[a, b] += factor * kept[e, b]
-        for a in range(n):
-            kept[e, a] *= inverse
-    for a in range(n):
+        last = min(first + _AT_ONCE, len(index))
+        _take_lost(first, last, value, kept, lost)
+        for e in range(first, last):
+            alone = light.alone[index[e]]
+            inverse = np.float32(1.0) / alone if index[e] > 0 and alone > np.float32(0) else np.float32(0)
+            for a in range(width):
+                scaled[e - first, a] = kept[e, a] * inverse
+        _add_to_gram(kept[first:last], scaled, gram, sums)
+        kept[first:last] = scaled[: last - first]
+    for a in range(width):
         gram[a, a] += n
-    solver = _invert(gram)
-    share = np.zeros((n, LANES), np.float32)
-    for r in range(LANES):
-        for a in range(n):
-            sum_of_lights = 0.0
-            for b in range(n):
-                sum_of_lights += solver[a, b] * lost[b, r]
-            share[a, r] = sum_of_lights
+    right, share = np.zeros((width, LANES), np.float64), np.empty((width, LANES), np.float32)
+    right[:n] = lost
+    _solve(gram, right)
+    share[:] = right
     _add_change(kept, share, value)
 
 

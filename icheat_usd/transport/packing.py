@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels import packing as kernels
+from icheat_usd.kernels.workers import overlapping
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import ClusterTree, GatherSamples
 from icheat_usd.samples.wavelets import haar_forward
@@ -16,7 +19,7 @@ from icheat_usd.transport.build import Lobe, Transport
 from icheat_usd.transport.packed import LANES, PackedLobe, PackedRows, PackedTransport, PackingReport
 from icheat_usd.transport.sparse import SparseRows
 
-_TILES_AT_ONCE = 16
+_TILES_AT_ONCE = 8
 # That the amount to keep is found on; spread over all. With 16, and 48 lights instead of 96, it jumped by up to 14
 # times when other samples were drawn, now by 3.
 _TILES_OF_A_TRIAL = 64
@@ -48,27 +51,35 @@ class _Tile(NamedTuple):
     value: NDArray[np.int8]
 
 
-class _Packer:
-    """Packs tiles of rows on one tree; keeps what that needs from one time to the next."""
+class _Room(threading.local):
+    """Scratch and results of a few tiles, of each thread that packs."""
 
-    def __init__(self, tree: ClusterTree) -> None:
-        self.tree = tree
-        self._tables = _haar_tables(tree)
-        self._make_room(min(tree.n_leaves, _FIRST_ROOM))
+    def __init__(self, room: int) -> None:
+        self.make(room)
 
-    def _make_room(self, room: int) -> None:
+    def make(self, room: int) -> None:
         n = _TILES_AT_ONCE
-        self._index, self._value = np.empty((n, room), np.int32), np.empty((n, room, LANES), np.float32)
-        self._packed = _Tile(
+        self.index, self.value = np.empty((n, room), np.int32), np.empty((n, room, LANES), np.float32)
+        self.packed = _Tile(
             np.empty((n, 2 * room), np.int32),
             np.empty((n, 2 * room), np.float32),
             np.empty((n, 2 * room), np.float32),
             np.empty((n, 2 * room, LANES), np.int8),
         )
 
+
+class _Packer:
+    """Packs tiles of rows on one tree; keeps what that needs from one time to the next."""
+
+    def __init__(self, tree: ClusterTree) -> None:
+        self.tree = tree
+        self._tables = _haar_tables(tree)
+        self._room = _Room(min(tree.n_leaves, _FIRST_ROOM))
+
     def pack(self, part: _Weighted, light: kernels.Light, tiles: I64, least: float) -> list[_Tile]:
         """Pack a few tiles with the coefficients that are worth at least `least`."""
         count, n_kept = np.zeros((2, len(tiles)), np.int64)
+        room = self._room
         while True:
             kernels.pack_tiles(
                 self._tables,
@@ -76,16 +87,16 @@ class _Packer:
                 tiles,
                 light,
                 np.float32(least),
-                self._index,
-                self._value,
-                *self._packed,
+                room.index,
+                room.value,
+                *room.packed,
                 count,
                 n_kept,
             )
-            if n_kept.max() <= self._index.shape[1]:
+            if n_kept.max() <= room.index.shape[1]:
                 break
-            self._make_room(min(self.tree.n_leaves, 5 * int(n_kept.max()) // 4))
-        index, scale, worth, value = self._packed
+            room.make(min(self.tree.n_leaves, 5 * int(n_kept.max()) // 4))
+        index, scale, worth, value = room.packed
         return [
             _Tile(index[i, :n].copy(), scale[i, :n].copy(), worth[i, :n].copy(), value[i, :n].copy())
             for i, n in enumerate(count)
@@ -153,10 +164,10 @@ def pack_on_tree(
     done = 0
     for lobe, part in zip(transport.lobes, weighted, strict=True):
         tiles: list[_Tile] = []
-        for first in range(0, _n_tiles(part.rows), _TILES_AT_ONCE) if part.rows.n_entries else ():
-            some = np.arange(first, min(first + _TILES_AT_ONCE, _n_tiles(part.rows)))
-            tiles += packer.pack(part, light, some, least)
-            done += len(some)
+        some = _few_at_once(np.arange(_n_tiles(part.rows) if part.rows.n_entries else 0))
+        for packed in overlapping([partial(packer.pack, part, light, few, least) for few in some]):
+            tiles += packed
+            done += len(packed)
             progress("pack the transport", done / n_tiles)
         lobes.append(PackedLobe(lobe.name, _join(tree, part.rows.n_rows, tiles), lobe.tint))
     report = PackingReport(light_error)
@@ -276,15 +287,20 @@ def _try(
 ) -> F64:
     """Squared errors of the lights `others` in some tiles packed by the lights `trained`."""
     of_half = part._replace(response=np.ascontiguousarray(part.response[:, trained]))
-    squared = np.zeros(len(others))
     unknown = np.ascontiguousarray(light.coefficients[:, others])
-    for first in range(0, len(tiles), _TILES_AT_ONCE):
-        some = tiles[first : first + _TILES_AT_ONCE]
-        packed = _join(packer.tree, len(some) * LANES, packer.pack(of_half, known, some, least))
-        exact = _part_of_tiles(part, some)
+
+    def of_few(few: I64) -> F64:
+        packed = _join(packer.tree, len(few) * LANES, packer.pack(of_half, known, few, least))
+        exact = _part_of_tiles(part, few)
         product = packed.multiply(unknown)[: len(exact.row_weight)]
-        squared += np.square(exact.row_weight) @ np.square((product - exact.response[:, others]).astype(np.float64))
-    return squared
+        error: F64 = np.square(exact.row_weight) @ np.square((product - exact.response[:, others]).astype(np.float64))
+        return error
+
+    return sum(overlapping([partial(of_few, few) for few in _few_at_once(tiles)]), np.zeros(len(others)))
+
+
+def _few_at_once(tiles: I64) -> list[I64]:
+    return [tiles[first : first + _TILES_AT_ONCE] for first in range(0, len(tiles), _TILES_AT_ONCE)]
 
 
 def _next_trial(tried: list[tuple[float, float]]) -> float:

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import pytest
 
+from icheat_usd.kernels.packing import Light, _refit_tile
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.tree import build_tree, split_samples
 from icheat_usd.samples.wavelets import haar_forward
@@ -226,3 +227,26 @@ def test_what_is_left_out_of_a_light_is_a_share_of_its_terms(scene: tuple[Cluste
         left_out = np.count_nonzero(terms < np.float32(least))
         squares = np.cumsum(terms.astype(np.float64) ** 2) / np.sum(terms.astype(np.float64) ** 2)
         assert squares[left_out - 1] <= share < squares[left_out]
+
+
+@pytest.mark.parametrize("n_lights", [1, 16, 37])
+def test_kept_coefficients_stand_in_for_others_by_ridge_regression(n_lights: int) -> None:
+    rng = np.random.default_rng(n_lights)
+    light = rng.normal(size=(400, n_lights)).astype(np.float32)
+    alone = rng.uniform(0.1, 2, 400).astype(np.float32)
+    index = np.sort(np.append(rng.choice(np.arange(1, 400), 150, replace=False), 0)).astype(np.int32)
+    value = rng.normal(size=(len(index), 64)).astype(np.float32)
+    exact = rng.normal(scale=20, size=(n_lights, 64)).astype(np.float32)
+
+    kept = light[index].astype(np.float64)
+    weighted = kept / alone[index, None]
+    weighted[0] = 0  # the root stays as it is
+    lost = exact - kept.T @ value
+    share = np.linalg.solve(weighted.T @ kept + n_lights * np.eye(n_lights), lost)
+    expected = value + weighted @ share
+
+    refitted = value.copy()
+    _refit_tile(Light(light, alone, alone), index, refitted, exact.copy())
+    np.testing.assert_allclose(refitted, expected, rtol=1e-4, atol=1e-4)
+    assert np.abs(refitted - value).max() > 0.1
+    assert np.array_equal(refitted[0], value[0])
