@@ -14,7 +14,7 @@ from icheat_usd.transport.sparse import SparseRows, concatenate_rows
 
 Piece = TypeVar("Piece")
 
-#: A fifth of a second of work, and some megabytes.
+#: Some tenths of a second of one worker, and some megabytes.
 _RAYS_PER_PIECE = 1 << 19
 
 
@@ -30,7 +30,7 @@ class PartStore(Protocol):
 class Pieces:
     """Pieces of work, always the same ones in the same order, each found in a store or made and kept there.
 
-    Two are made at a time where kernels may overlap; they must not depend on each other.
+    They are made by `overlapping`, so none may depend on another.
     """
 
     def __init__(

@@ -27,7 +27,7 @@ from icheat_usd.transport.sparse import SparseRows, add_shares, concatenate_rows
 
 Chunk = TypeVar("Chunk")
 
-#: A fifth of a second: who interrupts waits for two such chunks.
+#: Some tenths of a second of one worker: who interrupts waits for the chunks that are on their way.
 _RAYS_AT_ONCE = 1 << 19
 _UNITS = 1024  # of a ray: counts stay whole numbers where mirrors and glass let part of its light through
 #: Of a row that is measured in parts: float32 shares give back counts of units below 2^23.
