@@ -8,13 +8,11 @@ choice must be good for any light of their kinds, in any place.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from icheat_usd.kernels.rows import mean_over_segments
 from icheat_usd.kernels.samples import cosine_rays
-from icheat_usd.kernels.workers import overlapping
 from icheat_usd.materials import effective_albedo, take_points
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I64, SceneSnapshot, SurfacePoints
@@ -83,27 +81,25 @@ def training_radiance(
     Lights are points of view for choices, not pictures: one shadow ray per
     patch point, mean albedo. Depends on the seed alone.
     """
-    places = _find_places(snapshot, tracer, gather, np.random.default_rng(seed), seed)
+    rng = np.random.default_rng(seed)
+    places = _find_places(snapshot, tracer, gather, rng, seed)
     sky = _find_sky(snapshot, tracer, gather, seed)
     kinds = _OUTDOORS if len(sky.cell) else _INDOORS
     lamp = _Lamp(snapshot, tracer, gather)
-
-    def lit(light: int) -> F32:
-        kind, rng = kinds[light % len(kinds)], np.random.default_rng((seed, light))
+    out = np.empty((n, gather.n), np.float32)
+    for light in range(n):
+        kind = kinds[light % len(kinds)]
         for _ in range(_TRIES):
             if kind == "dome":
-                out = _under_dome(sky, gather.n, rng) * lamp.cell_albedo
+                out[light] = _under_dome(sky, gather.n, rng) * lamp.cell_albedo
             elif kind == "sun":
-                out = lamp.parallel(*_sun(sky, rng), rng)
+                out[light] = lamp.parallel(*_sun(sky, rng), rng)
             else:
-                out = lamp.shine(_place(kind, places, rng), rng)
-            if out.any():
-                return out
-        return lamp.cell_albedo
-
-    out = np.empty((n, gather.n), np.float32)
-    for light, radiance in enumerate(overlapping([partial(lit, light) for light in range(n)])):
-        out[light] = radiance
+                out[light] = lamp.shine(_place(kind, places, rng), rng)
+            if out[light].any():
+                break
+        else:
+            out[light] = lamp.cell_albedo
     total = out.T.copy()
     last = total
     albedo = bounces.albedo.mean(axis=1)[:, None]
