@@ -7,7 +7,9 @@ distance and cosines of a single point would have.
 
 While a light moves little by little, most places see what they saw. Every place keeps what its last ray met. A
 frame sends the rays of a part of each run of places, another part each time; where these meet what they met
-before, the others keep what they know, and where one does not, all of the run are sent.
+before, the others keep what they know, and where one does not, all of the run are sent. Where points of the light
+itself came behind a surface or out of it, as on a light that is pushed into a wall, that is so for places everywhere:
+rays to such points, of which the caller knows from few places, are sent always, and say nothing of the rest of a run.
 
 .. [1] Talbot, Cline, Egbert 2005, Importance Resampling for Global Illumination.
 """
@@ -104,8 +106,9 @@ def _trace(
 
 @kernel
 def _ask(
-    chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, state: np.ndarray, asks: np.ndarray
-) -> None:
+    chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, turned: np.ndarray, state: np.ndarray,
+    asks: np.ndarray,
+) -> None:  # fmt: skip
     """Which places of a run send a ray at first, and what the others know; `chosen` is -1 where there is no point."""
     # Loops without branches, which the compiler turns into vectors.
     if phase >= 0:
@@ -113,6 +116,9 @@ def _ask(
             same = known[j] >> 2 == chosen[j]
             state[j] = known[j] & 3 if same and chosen[j] >= 0 else _BLOCKED
             asks[j] = 1 if chosen[j] >= 0 and (not same or (j & (PART - 1)) == phase) else 0
+        if len(turned) > 0:
+            for j in range(len(known)):
+                asks[j] |= turned[chosen[j]] if chosen[j] >= 0 else 0
         for j in range(len(known), RUN):
             state[j], asks[j] = _BLOCKED, 0
     else:
@@ -124,14 +130,15 @@ def _ask(
 @kernel
 def _agree(
     rows: np.ndarray, offset: int, chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
-    state: np.ndarray,
+    turned: np.ndarray, state: np.ndarray,
 ) -> bool:  # fmt: skip
     """Whether the rays of a run, those of `rows` less `offset`, allow that its other places send none."""
     if phase >= 0:
         alike = True
         for q in range(len(rows)):
             j = rows[q] - offset
-            alike &= known[j] >> 2 != chosen[j] or known[j] & 3 == state[j]
+            expected = len(turned) > 0 and turned[chosen[j]] != 0
+            alike &= expected or known[j] >> 2 != chosen[j] or known[j] & 3 == state[j]
         return alike
     if not share_rays:
         return True
@@ -157,7 +164,7 @@ def _append_rows(asks: np.ndarray, offset: int, count: int, rows: np.ndarray) ->
 def _meet(
     function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, runs: np.ndarray,
     found: np.ndarray, rays: np.ndarray, valid: np.ndarray, chosen: np.ndarray, share_rays: bool, phase: int,
-    known: np.ndarray, state: np.ndarray,
+    known: np.ndarray, turned: np.ndarray, state: np.ndarray,
 ) -> None:  # fmt: skip
     """Find what is between the places of some runs and their points, `chosen` (n_runs, RUN)."""
     n = len(runs)
@@ -165,7 +172,8 @@ def _meet(
     rows, others = np.empty(n * RUN + 1, np.int32), np.empty(n * RUN + 1, np.int32)
     every_state = state.reshape(-1)
     for k in range(n):
-        _ask(chosen[k], share_rays, phase, known[runs[k] * RUN : (runs[k] + 1) * RUN], state[k], asks[k])
+        knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
+        _ask(chosen[k], share_rays, phase, knows, turned, state[k], asks[k])
         begin[k + 1] = _append_rows(asks[k], k * RUN, begin[k], rows)
     _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, rows, begin[n], every_state)
     count = 0
@@ -173,7 +181,7 @@ def _meet(
         offset = k * RUN
         some = rows[begin[k] : begin[k + 1]]
         knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
-        if not _agree(some, offset, chosen[k], share_rays, phase, knows, state[k]):
+        if not _agree(some, offset, chosen[k], share_rays, phase, knows, turned, state[k]):
             for j in range(RUN):
                 asks[k, j] = 1 if chosen[k, j] >= 0 and asks[k, j] == 0 else 0
             count = _append_rows(asks[k], offset, count, others)
@@ -236,7 +244,8 @@ def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
     colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray, place: np.ndarray,
     tint: np.ndarray, gloss: np.ndarray, lobes: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
-    row: np.ndarray, wanted: np.ndarray, out: np.ndarray, through: np.ndarray, first: int, last: int,
+    turned: np.ndarray, row: np.ndarray, wanted: np.ndarray, out: np.ndarray, through: np.ndarray, first: int,
+    last: int,
 ) -> None:  # fmt: skip
     """`light_places` for those runs that are `wanted` from number `first` up to `last`."""
     n, candidates, width = last - first, points.shape[0], points.shape[2]
@@ -281,7 +290,7 @@ def _light_runs(
         chosen[k, size:] = -1
     _meet(
         function, arguments, opaque, passing, distant, place, runs[:n], found, rays, valid, chosen, share_rays, phase,
-        known, state,
+        known, turned, state,
     )  # fmt: skip
     for k in range(n):
         run = runs[k]
@@ -326,6 +335,7 @@ def light_places(
     share_rays: bool,
     phase: int,
     known: np.ndarray,
+    turned: np.ndarray,
     row: np.ndarray,
     wanted: np.ndarray,
     out: np.ndarray,
@@ -365,6 +375,8 @@ def light_places(
         Which part of the places sends rays where the others may keep what is `known`; -1: nothing is known.
     known : (n,) int16, changed
         What each place has found between it and its point; none: nobody wants to know.
+    turned : (n_points,) int32
+        1 for points whose rays meet something else than before from most places; none: that is not known.
     row : (n,) int32
         Row of `out` that each place has, all different.
     wanted : (n_wanted,) int32
@@ -383,6 +395,6 @@ def light_places(
         task = 2 * turn_of if turn_of < half else 2 * (turn_of - half) + 1
         _light_runs(
             function, arguments, opaque, passing, points, first_point, colors, light, distant, seed, turn, bounds,
-            place, tint, gloss, lobes, share_rays, phase, known, row, wanted, out, through, task * _RUNS,
+            place, tint, gloss, lobes, share_rays, phase, known, turned, row, wanted, out, through, task * _RUNS,
             min(n_runs, (task + 1) * _RUNS),
         )  # fmt: skip

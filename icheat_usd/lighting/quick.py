@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers
-from icheat_usd.kernels.shadow import GLOSS, PART, STRIDE, light_places
+from icheat_usd.kernels.shadow import GLOSS, PART, STATES, STRIDE, light_places
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.kernels.shaping import shape_places
 from icheat_usd.lighting.controls import darken, emission_frame, without
@@ -24,6 +25,10 @@ _ALPHA = 6  # column of the tables of lobes
 _POINT_COLUMNS = [0, 1, 2, 3, 4, 5, 9]  # of the table of a light's points: place, normal, what it brings
 _CANDIDATES = 4  # points of the light that a place looks at
 _FEW_CANDIDATES = 2  # where places share rays
+_NO_POINTS = np.zeros(0, np.int32)
+# Share of the places that look at a point from which it counts as turned, and how many places there must be. Some see
+# nothing of a point on either side of the surface that it crosses.
+_TURNED_SHARE, _LEAST_LOOKS = 0.25, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +110,23 @@ class LastLook:
         self.known = np.full(places.n, -1, np.int16)
         self.n = 0  #: looks so far
 
+    def turned_points(self, before: NDArray[np.int16], n_points: int) -> I32:
+        """Points of the light whose rays now mostly meet something else than in the look before: 1 each (n_points,).
+
+        Parameters
+        ----------
+        before : (n,)
+            What `known` was then.
+        """
+        phase = (self.n - 1) % PART  # of the places that sent a ray, whatever others saw
+        old, new = before[phase::PART], self.known[phase::PART]
+        same = (old >= 0) & (new >= 0) & (old // STATES == new // STATES)
+        old, new = old[same], new[same]
+        looks = np.bincount(new // STATES, minlength=n_points)
+        other = np.bincount(new[old != new] // STATES, minlength=n_points)
+        turned: I32 = ((looks >= _LEAST_LOOKS) & (other > _TURNED_SHARE * looks)).astype(np.int32)
+        return turned
+
     def forget(self, runs: I64) -> None:
         """Nothing is known of the places of some runs any more."""
         for run in runs:
@@ -178,6 +200,7 @@ def direct_at(
     last: LastLook | None = None,
     shining: tuple[F32, bool] | None = None,
     runs: I32 | None = None,
+    turned: I32 | None = None,
 ) -> None:
     """Light of a one-light snapshot that places reflect, one shadow ray each, into `out` (n, 3) in the points' order.
 
@@ -195,6 +218,8 @@ def direct_at(
         What `light_points` has for the snapshot and the seed, if that is known.
     runs : (n_runs,), optional
         Runs of places that are meant, by default all; what others have in `out` means nothing then.
+    turned : (n_points,), optional
+        What `LastLook.turned_points` found at other places: their rays are sent whatever `last` knows.
     """
     controls = snapshot.controls(0)
     tint, gloss = places.tint, places.gloss
@@ -233,13 +258,14 @@ def direct_at(
         share_rays,
         phase,
         known,
+        _NO_POINTS if turned is None or not turned.any() else turned,
         places.row,
         np.arange(len(places.place), dtype=np.int32) if runs is None else runs,
         out,
         through,
     )
     if shadows.passing is not None:
-        rows = np.flatnonzero(through)
+        rows = np.flatnonzero(through != 0)  # of bool, several times as fast
         origin, end = places.place[rows // RUN, :3, rows % RUN], table[through[rows] - 1, :3]
         direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
         out[places.row[rows]] *= shadows.crossing(snapshot, origin, direction, limit)[:, None]

@@ -35,7 +35,13 @@ class CloserLook:
         self._found: F32 = np.empty((patches.n, 3), np.float32)
 
     def improve(
-        self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: tuple[F32, bool], direct: F32
+        self,
+        alone: SceneSnapshot,
+        shadows: Shadows,
+        seed: int,
+        shining: tuple[F32, bool],
+        direct: F32,
+        turned: I32 | None = None,
     ) -> None:
         """Make the light of noisy cells that of their patch points.
 
@@ -45,6 +51,8 @@ class CloserLook:
             As `direct_at` has them.
         direct : (n_cells, 3), changed
             From one look at each cell.
+        turned
+            As `direct_at` has it.
         """
         light, runs = self._noisy_runs(direct)
         before, self._looked_at = self._looked_at, np.zeros_like(self._looked_at)
@@ -53,7 +61,7 @@ class CloserLook:
         self._last.forget(np.flatnonzero(self._looked_at > before))
         if not len(runs):
             return
-        direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs)
+        direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs, turned)
         self._take(runs, direct)
         worst = self._worst_runs(direct, light, runs)
         if len(worst):

@@ -263,14 +263,18 @@ class MovingLight:
         """
         around = self._around
         self.following = last = self.following or Following(around)
-        assert around.cells is not None and around.tiles is not None and last.patches is not None
+        assert around.cells is not None and around.tiles is not None
+        assert last.cells is not None and last.patches is not None
         direct = np.empty((around.gather.n, 3), np.float32)
         shadows = around.shadows_of(self._alone)
+        before = last.cells.known.copy()
         direct_at(self._alone, shadows, around.cells, self._seed, False, direct, 0, last.cells, self._shining)
-        last.patches.improve(self._alone, shadows, self._seed, self._shining, direct)
+        turned = last.cells.turned_points(before, len(self._shining[0]))
+        last.patches.improve(self._alone, shadows, self._seed, self._shining, direct, turned)
         around.bounce(direct, radiance, self.direct, last.next_part())
         self.direct = direct
-        direct_at(self._alone, shadows, around.tiles, self._seed, True, view_direct, 0, last.view, self._shining)
+        view = around.tiles, self._seed, True, view_direct, 0, last.view, self._shining
+        direct_at(self._alone, shadows, *view, turned=turned)
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """Another round at the cells or at the view; False after the last."""

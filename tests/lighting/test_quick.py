@@ -147,6 +147,41 @@ def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
     np.testing.assert_array_equal(found, fresh)
 
 
+def test_a_light_that_is_pushed_into_a_wall_turns_those_of_its_points_that_cross_it() -> None:
+    """Some places tell which, and where others know it, rays to these points find all that has changed."""
+    light = Light(LightKind.RECT, (3, 2, 1), (translation(-0.3, 1.0, 0) @ rotation((1, 0, 0), -90))[:3], (0.8, 0.5))
+    floor = quads([[[-2, 0, 2], [0, 0, 2], [0, 0, -2], [-2, 0, -2]]])
+    wall = quads([[[0, -1, -2], [0, -1, 2], [0, 3, 2], [0, 3, -2]]])
+    snapshot = make_snapshot([Mesh(floor, Material(0.5)), Mesh(wall, Material(0.5))], lights=[light])
+    shadows, images = build_shadows(snapshot, tracer_of(snapshot)), LightImages(snapshot.textures)
+    points = on_floor(snapshot, 8000)
+    many = prepare_places(snapshot, points, points.albedo, None)
+    others = on_floor(snapshot, 40_000)
+    told = prepare_places(snapshot, others, others.albedo, None)
+    of_told, of_many, untold = LastLook(told), LastLook(many), LastLook(many)
+    found, alike, fresh = np.empty((3, 8000, 3), np.float32)
+    behind, missed, crossed = np.zeros(0, bool), 0, set[int]()
+    for step in range(6):
+        to_world = translation(0.04 * step, 0, 0) @ np.vstack([light.to_world, [0, 0, 0, 1]])
+        alone = changed_light(images, one_light(snapshot, 0), to_world=to_world[:3])
+        table = light_points(alone, 5)[0]
+        before, was_behind, behind = of_told.known.copy(), behind, table[:, 0] > 0
+        direct_at(alone, shadows, told, 5, False, np.empty((told.n, 3), np.float32), last=of_told)
+        turned = of_told.turned_points(before, len(table))
+        direct_at(alone, shadows, many, 5, False, found, last=of_many, turned=turned)
+        direct_at(alone, shadows, many, 5, False, alike, last=untold)
+        direct_at(alone, shadows, many, 5, False, fresh)
+        if step:
+            now = set(np.flatnonzero(behind != was_behind))
+            # Some places send their rays in a later look, and find out then.
+            assert now <= set(np.flatnonzero(turned)) <= now | crossed
+            crossed |= now
+        np.testing.assert_array_equal(found, fresh)
+        missed += int((alike != fresh).any(axis=1).sum())
+    assert missed > 0  # by runs of which no ray went to a point that has crossed
+    assert len(crossed) > 20 and 0.1 < behind.mean() < 0.9
+
+
 @pytest.mark.parametrize("name", ["rect", "sun"])
 def test_some_runs_of_places_get_what_all_would(name: str) -> None:
     """To the bit, through holes and glass as well; what is kept of others stays."""
