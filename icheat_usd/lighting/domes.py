@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.kernels import domes as kernels
 from icheat_usd.kernels.direct import fill_analytic
+from icheat_usd.kernels.workers import overlapping
 from icheat_usd.lighting.change import LightImages, append_texture, new_light, texture_image
 from icheat_usd.lighting.direct import own_draws
 from icheat_usd.lighting.guide import Effort
 from icheat_usd.lighting.quick import Shadows
 from icheat_usd.lighting.sampler import LightSampler, build_light_sampler
 from icheat_usd.materials import evaluate_specular, is_glossy, take_points
-from icheat_usd.scene import F32, I64, PLAIN, Bool, LightControls, LightKind, SceneSnapshot, SurfacePoints, Textures
+from icheat_usd.scene import (
+    F32,
+    F64,
+    I64,
+    PLAIN,
+    Bool,
+    LightControls,
+    LightKind,
+    SceneSnapshot,
+    SurfacePoints,
+    Textures,
+)
 from icheat_usd.tracing import Tracer, spawn_points
 
 _RAYS = 1 << 18  # at a time
 _WIDTH = 256  # an image is brought to this width once, so that a small sun is never missed between lookups
 _LOOKS = 2  # lookups per bin and axis
+_NO_LOBES: F32 = np.empty(0, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +56,16 @@ class SeenSky:
         if controls.specular != 1.0:
             gloss_tint = gloss_tint * np.float32(controls.specular)
         kernels.shine(self.begin, self.bins, self.diffuse, self.glossy, sky, tint, gloss_tint, out)
+
+
+class _Seen(NamedTuple):
+    """What some points see of the sky, by ray."""
+
+    point: I64
+    bins: np.ndarray  # uint16
+    irradiance: F32  # per radiance
+    lobe: np.ndarray  # the same of the specular lobe, or none
+    edges: F64  # (n_points, 2) sums of what multiplies the two specular colours
 
 
 def white_sky(
@@ -80,32 +105,31 @@ def see_sky(
     lit : (n,) bool, optional
         Points that the sky shines on; by default all.
     """
-    # empty ones first: a camera may see no surface
-    owners, bins = [np.empty(0, np.int64)], [np.empty(0, np.uint16)]
-    weights, lobes = [np.empty(0, np.float32)], [np.empty(0, np.float32)]
-    edge_parts = np.zeros((len(points.instance), 2))
     step = max(1, _RAYS // n_samples)
-    for first in range(0, len(points.instance), step):
+
+    def look(first: int) -> _Seen:
         part = take_points(points, slice(first, first + step))
         point, direction, value = _visible(even, sampler, shadows, part, first, n_samples, seed)
         if lit is not None:
             kept = np.flatnonzero(lit[first + point])
             point, direction, value = point[kept], np.take(direction, kept, axis=0), value[kept]
         cosine = np.maximum(np.einsum("ij,ij->i", part.shading_normal[point], direction), 1e-6)
-        owners.append(point + first)
         row = np.empty(len(point), np.uint16)
         kernels.find_bins(direction, row)
-        bins.append(row)
-        weights.append(value)
-        if to_eye is not None:
-            there = take_points(part, point)
-            terms = evaluate_specular(there, to_eye[first + point], direction)
-            base, edge = (term / cosine * value for term in (terms.base, terms.edge))
-            edge_parts[first : first + step, 0] += np.bincount(point, base, len(part.instance))
-            edge_parts[first : first + step, 1] += np.bincount(point, edge, len(part.instance))
-            # as grey as dielectrics are; the colour of metals comes with `gloss_tint`
-            lobes.append(there.specular.mean(axis=1) * base + there.specular_edge.mean(axis=1) * edge)
-    owner, weight = np.concatenate(owners), np.concatenate(weights)
+        if to_eye is None:
+            return _Seen(point + first, row, value, _NO_LOBES, np.zeros((len(part.instance), 2)))
+        there = take_points(part, point)
+        terms = evaluate_specular(there, to_eye[first + point], direction)
+        base, edge = (term / cosine * value for term in (terms.base, terms.edge))
+        edges = [np.bincount(point, of_lobe, len(part.instance)) for of_lobe in (base, edge)]
+        # as grey as dielectrics are; the colour of metals comes with `gloss_tint`
+        lobe = there.specular.mean(axis=1) * base + there.specular_edge.mean(axis=1) * edge
+        return _Seen(point + first, row, value, lobe, np.stack(edges, axis=1))
+
+    # an empty one first: a camera may see no surface
+    seen = [_Seen(np.empty(0, np.int64), np.empty(0, np.uint16), _NO_LOBES, _NO_LOBES, np.zeros((0, 2)))]
+    seen += overlapping([partial(look, first) for first in range(0, len(points.instance), step)])
+    owner, bins, weight, lobes, edge_parts = (np.concatenate(columns) for columns in zip(*seen, strict=True))
     if begin is not None:
         cell = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
         weight = np.asarray(weight / np.diff(begin)[cell[owner]], np.float32)
@@ -116,10 +140,10 @@ def see_sky(
     if to_eye is not None and is_glossy(points).any():
         color = points.specular * edge_parts[:, :1] + points.specular_edge * edge_parts[:, 1:]
         gloss_tint = (color / np.maximum(color.mean(axis=1, keepdims=True), 1e-30)).astype(np.float32)
-        glossy = np.concatenate(lobes).astype(np.float32)
+        glossy = lobes.astype(np.float32)
     return SeenSky(
         ends,
-        np.concatenate(bins),
+        bins,
         weight.astype(np.float32),
         glossy,
         np.ascontiguousarray(tint, np.float32),
