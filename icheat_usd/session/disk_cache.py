@@ -7,7 +7,8 @@ everything the product depends on (see `content_keys`), so nothing here ever
 goes stale: it is only forgotten. A part is written to a temporary file, flushed
 and renamed, so that it is there whole or not at all, and carries a digest of
 its bytes in its name, so that a damaged one is noticed and dropped. A build
-that is stopped goes on from the parts that are there.
+that is stopped goes on from the parts that are there. Whole products are
+written by a thread of their own: nobody waits for the disk but who looks there.
 
 Folders that were used last longest ago are removed when all together exceed
 ``$ICHEAT_CACHE_SIZE`` (such as ``20G``; 0 keeps nothing).
@@ -20,6 +21,7 @@ import json
 import os
 import re
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -79,6 +81,47 @@ class ShelfInfo:
     about: Mapping[str, Any]  #: what it was made for, for people
 
 
+class _Writing:
+    """Work for the disk that goes on behind its caller's back, one piece after another; the program ends after it."""
+
+    def __init__(self) -> None:
+        self._lock, self._own = threading.Lock(), threading.local()
+        self._last: dict[Path, threading.Thread] = {}  # that works on each folder
+        self._error: Exception | None = None
+
+    def start(self, folder: Path, work: Callable[[], None]) -> None:
+        """Do something in a folder once all that was asked for before is done."""
+        with self._lock:
+            before = list(self._last.values())
+            thread = threading.Thread(target=self._run, args=(before, work), name="icheat disk")
+            self._last = {other: one for other, one in self._last.items() if one.is_alive()} | {folder: thread}
+            thread.start()
+
+    def _run(self, before: list[threading.Thread], work: Callable[[], None]) -> None:
+        self._own.works = True
+        for thread in before:
+            thread.join()
+        try:
+            work()
+        except Exception as error:
+            self._error = error
+
+    def wait(self, folder: Path | None = None) -> None:
+        """Until nothing is under way in a folder, by default in any; raises what went wrong."""
+        if getattr(self._own, "works", False):
+            return  # the work itself looks
+        with self._lock:
+            threads = [one for other, one in self._last.items() if folder in (None, other)]
+        for thread in threads:
+            thread.join()
+        if (error := self._error) is not None:
+            self._error = None
+            raise error
+
+
+_WRITING = _Writing()
+
+
 class Shelf:
     """The parts of one product. All methods may be called from several threads and processes."""
 
@@ -87,6 +130,7 @@ class Shelf:
 
     def load(self, name: str) -> Any | None:
         """A part, or None where it is missing or damaged; a damaged one is removed."""
+        _WRITING.wait(self.folder)
         for path in sorted(self.folder.glob(f"{_checked(name)}-{'?' * _DIGITS}.npz")):
             try:
                 with open(path, "rb") as file:
@@ -121,6 +165,15 @@ class Shelf:
                     other.unlink(missing_ok=True)
         self._cache.trim(keep=self.folder)
 
+    def keep_whole(self, value: Any) -> None:
+        """Keep the product as one part, `whole`, instead of its pieces; goes on while the caller does."""
+
+        def keep() -> None:
+            self.save("whole", value)
+            self.drop(*(name for name in self.names() if name != "whole"))
+
+        _WRITING.start(self.folder, keep)
+
     def drop(self, *names: str) -> None:
         """Forget parts, such as the pieces of a whole that is kept now."""
         for name in names:
@@ -130,6 +183,7 @@ class Shelf:
 
     def names(self) -> tuple[str, ...]:
         """Parts that are there, checked or not."""
+        _WRITING.wait(self.folder)
         return tuple(sorted(path.stem[: -_DIGITS - 1] for path in self.folder.glob("*.npz") if path.stem[0] != "."))
 
 
@@ -158,6 +212,7 @@ class DiskCache:
 
     def list(self) -> tuple[ShelfInfo, ...]:
         """All products, the one used last first."""
+        _WRITING.wait()
         return tuple(sorted(self._read(), key=lambda info: -info.used))
 
     def _read(self) -> Iterator[ShelfInfo]:
@@ -175,7 +230,7 @@ class DiskCache:
 
     def trim(self, keep: Path | None = None) -> int:
         """Remove what was used last longest ago until the limit holds; how many bytes that freed."""
-        found = self.list()
+        found = tuple(sorted(self._read(), key=lambda info: -info.used))
         total = sum(info.bytes for info in found)
         freed = 0
         for info in reversed(found):

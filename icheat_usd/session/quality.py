@@ -22,7 +22,7 @@ class Quality:
     record_error: float | None = None  #: relative RMS error that rows kept where they are needed, instead of on a grid,
     #: may add by interpolation; None keeps them on the grid of `row_spacing`
     record_share: float = 0.2  #: of the view samples, that such rows are kept at, at most
-    record_rays: int = 1536  #: gather rays of such a row, on average
+    record_rays: int = 1792  #: gather rays of such a row, on average
     packing_error: float | None = None  #: relative RMS error that packed rows may add; None keeps them exact
     light_samples: int = 16  #: shadow rays per light and point
     dome_samples: int | None = None  #: for the direct light of domes in the image; 4 `light_samples` by default
@@ -42,7 +42,7 @@ RECORDS = replace(PREVIEW, record_error=0.01, rays_per_bounce_row=256)
 
 #: The same, packed so that a frame takes milliseconds. Lights that an artist sets lose a third to all of what plausible
 #: lights lose, among which are beams on few cells; what is lost beyond this is noise of the rows.
-LIVE = replace(RECORDS, packing_error=0.03)
+LIVE = replace(RECORDS, packing_error=0.02)
 
 #: For a close look at what lives on.
 LIVE_FINE = replace(

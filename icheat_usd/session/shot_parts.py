@@ -181,7 +181,7 @@ class ShotParts:
                 last = self._memory.keep("transport", self.keys.transport, last)
             self.__dict__["transport"] = last
             if shelf is not None:
-                self._keep_whole(shelf, last)
+                shelf.keep_whole(last)
             if not is_packed:
                 return
         yield self.packed if is_packed else self.transport
@@ -300,16 +300,10 @@ class ShotParts:
         began = time.perf_counter()
         made = make(shelf)
         if time.perf_counter() - began > WORTH_KEEPING_SECONDS:
-            self._keep_whole(shelf, made)
+            shelf.keep_whole(made)
         else:
             shelf.drop(*shelf.names())
         return made
-
-    @staticmethod
-    def _keep_whole(shelf: Shelf, whole: Any) -> None:
-        """Keep a part instead of the pieces that it was made of."""
-        shelf.save("whole", whole)
-        shelf.drop(*(name for name in shelf.names() if name != "whole"))
 
     def _shelf(self, kind: str) -> Shelf:
         return self._disk.shelf(kind, getattr(self.keys, kind), self._about())

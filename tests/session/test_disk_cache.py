@@ -127,3 +127,21 @@ def test_a_limit_that_is_no_size_is_named(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("ICHEAT_CACHE_SIZE", "much")
     with pytest.raises(IcheatError, match="ICHEAT_CACHE_SIZE is 'much'"):
         size_limit()
+
+
+def test_a_whole_is_written_behind_ones_back_and_whoever_looks_waits_for_it(tmp_path: Path) -> None:
+    shelf = a_shelf(tmp_path)
+    shelf.save("piece-0", transport())
+    for value in (np.arange(4_000_000), np.arange(5_000_000)):  # the second waits for the first
+        shelf.keep_whole(value)
+    assert a_shelf(tmp_path).names() == ("whole",)
+    np.testing.assert_array_equal(a_shelf(tmp_path).load("whole"), np.arange(5_000_000))
+
+
+def test_what_goes_wrong_behind_ones_back_is_told_to_whoever_looks(tmp_path: Path) -> None:
+    shelf = a_shelf(tmp_path)
+    shelf.save("piece-0", 1)
+    shelf.keep_whole(object())
+    with pytest.raises(TypeError):
+        shelf.names()
+    assert shelf.names() == ("piece-0",)  # told once, and nothing is lost
