@@ -43,6 +43,38 @@ def order_terms(tiles: PairedTiles, m: int) -> TermColumns:
     return columns
 
 
+def find_of_jobs(
+    columns: TermColumns,
+    n_tiles: int,
+    size: NDArray[np.float32],
+    least: NDArray[np.float32],
+    tile: NDArray[np.int32],
+    version: NDArray[np.int32],
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Pairs of coefficients with a large term, of jobs (n,) of a tile and a version each, as `multiply_found` has them.
+
+    `size` and `least` as for `find_terms`, of all versions; of each tile and version there is one job at most.
+
+    Returns
+    -------
+    found_begin : (n + 1,) int64
+    found : (n_found,) int32
+    """
+    n, is_used = len(tile), np.zeros(len(size), np.bool_)
+    is_used[version] = True
+    used = np.flatnonzero(is_used)
+    none = np.arange(len(used))
+    job_of = np.empty((len(used), n_tiles), np.int32)
+    job_of[:] = n + none[:, None]
+    job_of[(np.cumsum(is_used) - 1)[version], tile] = np.arange(n)
+    count = np.zeros(n + len(used), np.int64)
+    find_terms(*columns, size, least, used, job_of, count, np.empty(0, np.int32))
+    begin = np.concatenate([[0], np.cumsum(count[:n])]).astype(np.int64)
+    found = np.empty(begin[-1] + len(used), np.int32)
+    find_terms(*columns, size, least, used, job_of, np.append(begin[:-1], begin[-1] + none), found)
+    return begin, found
+
+
 @kernel
 def count_columns(index, worth, begin):  # type: ignore[no-untyped-def]
     """First term of each coefficient, to `begin (m + 1,)`."""
@@ -75,20 +107,22 @@ def sort_columns(begin, worth, tile, pair):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _walk(begin, worth, tile, pair, size, least, job_of, place, found):  # type: ignore[no-untyped-def]
+def _walk(begin, worth, tile, pair, size, least, n_jobs, job_of, place, found):  # type: ignore[no-untyped-def]
     """Number of the pair of each large term of one version, to ``found[place[job]]``, of which each moves on."""
     n = 1 if least == np.inf else len(size)  # the mean alone, which is the first
+    counts = len(found) == 0
     for k in range(n):
         if not size[k] > 0:
             continue
         for i in range(begin[k], begin[k + 1]):
             if not size[k] * worth[i] >= least:
                 break
+            # Without a branch, of which half would be guessed wrong: what has no job goes to a place that stays.
             job = job_of[tile[i]]
-            if job >= 0:
-                if len(found) > 0:
-                    found[place[job]] = pair[i]
-                place[job] += 1
+            at = place[job]
+            if not counts:
+                found[at] = pair[i]
+            place[job] = at + np.int64(job < n_jobs)
 
 
 @kernel
@@ -135,15 +169,16 @@ def find_terms(begin, worth, tile, pair, size, least, versions, job_of, place, f
     versions : (n,) int64
         Which are meant.
     job_of : (n, n_tiles) int32
-        Job of each of these versions with each tile, -1 where there is none.
-    place : (n_jobs,) int64
-        First place of each job's pairs in `found`; moves to the end of them.
+        Job of each of these versions with each tile; where there is none, number ``n_jobs + i`` for the i-th.
+    place : (n_jobs + n,) int64
+        First place of each job's pairs in `found`, which moves to the end of them; of the others a place to scribble.
     found : (n_found,) int32
         Numbers of pairs, in no order and some twice; empty: they are but counted, in `place`.
     """
-    for i in prange(len(versions)):
+    n = len(versions)
+    for i in prange(n):
         v = versions[i]
-        _walk(begin, worth, tile, pair, size[v], least[v], job_of[i], place, found)
+        _walk(begin, worth, tile, pair, size[v], least[v], len(place) - n, job_of[i], place, found)
 
 
 @parallel_kernel

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import version_products as kernels
-from icheat_usd.kernels.found_terms import TermColumns, find_terms, multiply_found, order_terms
+from icheat_usd.kernels.found_terms import TermColumns, find_of_jobs, multiply_found, order_terms
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
@@ -108,17 +108,7 @@ class _Tiles:
     ) -> None:
         if self._columns is None:
             self._columns = order_terms(self._tiles, versions.shape[1])
-        n = len(tile)
-        is_used = np.zeros(len(versions), np.bool_)
-        is_used[version] = True
-        used = np.flatnonzero(is_used)
-        job_of = np.full((len(used), len(self._tiles.tile_begin) - 1), -1, np.int32)
-        job_of[(np.cumsum(is_used) - 1)[version], tile] = np.arange(n)
-        begin = np.zeros(n + 1, np.int64)
-        find_terms(*self._columns, size, least, used, job_of, begin[1:], np.empty(0, np.int32))
-        np.cumsum(begin, out=begin)
-        found = np.empty(begin[-1], np.int32)
-        find_terms(*self._columns, size, least, used, job_of, begin[:-1].copy(), found)
+        begin, found = find_of_jobs(self._columns, len(self._tiles.tile_begin) - 1, size, least, tile, version)
         _, index, scale, _, value = self._tiles
         multiply_found(index, scale, value, versions, begin, found, version, place, out)
 

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.found_terms import find_terms, multiply_found, order_terms
+from icheat_usd.kernels.found_terms import find_of_jobs, multiply_found, order_terms
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.packed import PairedTiles, pair_coefficients
 
@@ -62,15 +62,7 @@ def multiplied() -> np.ndarray:
     """All jobs by terms that are found; (n, 64, 4)."""
     tiles, (light, size, least), (tile, version, place) = some_tiles(), some_light(), some_jobs()
     columns = order_terms(tiles, N_COEFFICIENTS)
-    used = np.unique(version).astype(np.int64)
-    job_of = np.full((len(used), 5), -1, np.int32)
-    job_of[np.searchsorted(used, version), tile] = np.arange(len(tile))
-    begin = np.zeros(len(tile) + 1, np.int64)
-    find_terms(*columns, size, least, used, job_of, begin[1:], np.empty(0, np.int32))
-    np.cumsum(begin, out=begin)
-    found, end = np.full(begin[-1], -1, np.int32), begin[:-1].copy()
-    find_terms(*columns, size, least, used, job_of, end, found)
-    assert (end == begin[1:]).all() and (found >= 0).all()
+    begin, found = find_of_jobs(columns, 5, size, least, tile, version)
     out = np.zeros((len(tile), 64, 4), np.float32)
     multiply_found(tiles.index, tiles.scale, tiles.value, light, begin, found, version, place, out)
     return out
