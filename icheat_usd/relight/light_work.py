@@ -55,9 +55,9 @@ class SparseView(NamedTuple):
     interpolation: SparseRows  #: (n_view x n)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Surroundings:
-    """What every light of a view shines on; made once."""
+    """What every light of a view shines on; made once, but that `bounces` may be taken from more rays later."""
 
     snapshot: SceneSnapshot
     tracer: Tracer
@@ -227,6 +227,22 @@ class ExactBounces:
         return False
 
 
+class KnownLight:
+    """A light at rest whose bounces alone are solved anew."""
+
+    def __init__(self, around: Surroundings, direct: F32) -> None:
+        self._around, self.direct = around, direct
+        self._exact = ExactBounces(around, direct)
+
+    def step(self, radiance: F32, view_direct: F32) -> bool:
+        """Another bounce; False once all are done."""
+        return self._exact.step(radiance)
+
+    def restart_bounces(self) -> None:
+        """Bounces are to be solved with other rows."""
+        self._exact = ExactBounces(self._around, self.direct)
+
+
 class Following:
     """What is kept of a light from one first look to the next, while it moves."""
 
@@ -305,6 +321,10 @@ class MovingLight:
             self.direct = direct
         return True
 
+    def restart_bounces(self) -> None:
+        """Bounces are to be solved with other rows."""
+        self._exact = None
+
     def _find_highlights(self, view_direct: F32) -> bool:
         """Narrow lobes of some more view samples; False after the last."""
         view, first = self._around.view, self._n_found
@@ -327,7 +347,8 @@ class AnyLight:
         self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
     ) -> None:
         self._around, self._alone, self._seed = around, alone, seed
-        self._n_cells = light_samples
+        # What a dome shines on through a window is few cells, whose noise is that of the image.
+        self._n_cells = samples_per_light(alone, light_samples, None)[0]
         self._n_view = samples_per_light(alone, light_samples, dome_samples)[0]
         self._samplers: list[LightSampler] = []
         self._learning: Steps[LightSampler] | None = None
@@ -384,6 +405,10 @@ class AnyLight:
             return True
         view_direct[:] = self._view
         return False
+
+    def restart_bounces(self) -> None:
+        """Bounces are to be solved with other rows."""
+        self._exact = None
 
     def _sampler(self, which: int) -> LightSampler:
         """Of the cells (0) and of the view (1), learnt when first needed."""

@@ -18,7 +18,15 @@ from icheat_usd.lighting.change import (
     one_light,
 )
 from icheat_usd.lighting.domes import BinnedSky
-from icheat_usd.relight.light_work import AnyLight, Following, MovingLight, SparseView, Surroundings, build_surroundings
+from icheat_usd.relight.light_work import (
+    AnyLight,
+    Following,
+    KnownLight,
+    MovingLight,
+    SparseView,
+    Surroundings,
+    build_surroundings,
+)
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -30,7 +38,7 @@ class _Light:
     """One light, and the work on it that is left: None when it has its final quality."""
 
     alone: SceneSnapshot
-    work: AnyLight | MovingLight | None = None
+    work: AnyLight | MovingLight | KnownLight | None = None
     bins: BinnedSky | None = None  #: of a dome's image
     following: Following | None = None  #: what is kept until it rests
     direct: F32 | None = None  #: at the cells, of which the present radiance came
@@ -94,6 +102,15 @@ class LiveLights:
     def images(self) -> tuple[int, ...]:
         """Number of each light's image: other images have other numbers; 0 is that of the scene, or none."""
         return tuple(light.image for light in self._lights)
+
+    def take_bounces(self, bounces: Bounces) -> None:
+        """Solve the bounces of lights at rest with other rows, such as of more rays; on the move all stays as it is."""
+        self._around.bounces = bounces
+        for state in self._lights:
+            if state.work is not None:
+                state.work.restart_bounces()
+            elif state.direct is not None:
+                state.work = KnownLight(self._around, state.direct)
 
     def snapshot(self) -> SceneSnapshot:
         """The scene with the lights as they are now; gains are multiplied into their radiance."""

@@ -40,6 +40,7 @@ class ShotKeys:
     view: str
     gather: str
     bounces: str
+    rest_bounces: str
     training: str
     transport: str
     packed: str
@@ -66,6 +67,7 @@ def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKey
     lights, domes = (_lights(snapshot, only) for only in (None, LightKind.DOME))
     gather = digest("gather", sight, quality.n_gather)
     bounces = digest("bounces", gather, quality.rays_per_bounce_row)
+    rest_bounces = digest("rest bounces", bounces, quality.rest_bounce_rays)
     training = digest("training", bounces)
     # Records stand where light that bounces would show them.
     rows = gather if quality.record_error is None else training
@@ -74,7 +76,9 @@ def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKey
     cell_light = digest("cell light", bounces, lights, quality.n_bounces, quality.light_samples)
     view_light = digest("view light", sight, lights, quality.light_samples, quality.dome_samples)
     view = digest("view", sight, domes)  # the sky behind the scene is part of the view
-    return ShotKeys(scene, view, gather, bounces, training, transport, packed, lights, cell_light, view_light)
+    return ShotKeys(
+        scene, view, gather, bounces, rest_bounces, training, transport, packed, lights, cell_light, view_light
+    )
 
 
 def snapshot_key(snapshot: SceneSnapshot, engine: str) -> str:
@@ -88,7 +92,8 @@ def snapshot_key(snapshot: SceneSnapshot, engine: str) -> str:
 
 def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     """All settings but those that other keys hold, or that come after the transport."""
-    elsewhere = {"n_gather", "rays_per_bounce_row", "light_samples", "dome_samples", "n_bounces", "samples_per_pixel"}
+    elsewhere = {"n_gather", "rays_per_bounce_row", "rest_bounce_rays", "n_bounces"}
+    elsewhere |= {"light_samples", "dome_samples", "samples_per_pixel"}
     at_records, everywhere = {"record_rays", "record_share"}, {"rays_per_row", "row_spacing", "shared_rays"}
     unused = at_records if quality.record_error is None else everywhere
     without = elsewhere | unused | {"packing_error"}

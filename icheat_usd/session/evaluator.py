@@ -19,7 +19,7 @@ from icheat_usd.session.light_changes import light_of_stage
 from icheat_usd.session.live_state import UNCHANGED, EditChange, LightChange, LiveState
 from icheat_usd.session.seen_light import SeenLight
 from icheat_usd.session.shot_parts import ShotParts
-from icheat_usd.transport import HeldBack, Transport
+from icheat_usd.transport import Bounces, HeldBack, Transport
 from icheat_usd.transport.packed import PackedTransport
 
 _DARK = (0.0, 0.0, 0.0)
@@ -61,6 +61,8 @@ class Evaluator:
         self.relighter = LiveRelighter(
             parts.snapshot, parts.view, parts.gather, transport, self.lights, held_back=held_back
         )
+        # That bounces of more rays come of, once all that takes less is at rest.
+        self._parts = None if is_coarse or not parts.has_rest_bounces else parts
         self._seen = SeenLight(parts.snapshot, parts.view)
         self._shown = UNCHANGED
         self._stack: EditStack | None = None
@@ -104,6 +106,21 @@ class Evaluator:
     def refine(self) -> bool:
         """A bounded piece of work towards what the settings ask for; False when nothing is left."""
         return self.relighter.refine()
+
+    @property
+    def wants_bounces(self) -> bool:
+        """Whether lights at rest are still without the rays that the settings ask for; see `more_bounces`."""
+        return self._parts is not None
+
+    def more_bounces(self) -> Bounces:
+        """What `take_bounces` takes; takes seconds, and touches nothing that is shown."""
+        assert self._parts is not None
+        return self._parts.rest_bounces
+
+    def take_bounces(self, bounces: Bounces) -> None:
+        """Lights at rest are worked out with these from now on: `refine` has work to do."""
+        self.lights.take_bounces(bounces)
+        self._parts = None
 
     def _laid_over(self, stack: EditStack, state: LiveState) -> EditStack:
         """As `LiveState.laid_over`; edits that did not change stay the same objects, which is how it is noticed."""

@@ -368,10 +368,17 @@ class LiveFrames:
                 frame = self.resident.get(number)
                 if frame is None or frame.evaluator is None or frame.level is not Level.FULL:
                     return
-                frame.evaluator.show(self.stack_of(frame), self.state)
-                if not frame.evaluator.refine():
+                evaluator = frame.evaluator
+                evaluator.show(self.stack_of(frame), self.state)
+                if evaluator.refine():
+                    continue
+                if not evaluator.wants_bounces:
                     frame.level = Level.REST
                     break
+            bounces = evaluator.more_bounces()
+            with self._background.lock:
+                if evaluator.wants_bounces:
+                    evaluator.take_bounces(bounces)
         self._tell(LiveEvent("better", number, Level.REST))
 
     def _progress(self, step: str, fraction: float) -> None:

@@ -17,6 +17,7 @@ class Quality:
     n_gather: int = 65_536
     rays_per_row: int = 256
     rays_per_bounce_row: int = 128
+    rest_bounce_rays: int | None = None  #: of such a row for live lights at rest; None: no more than at first
     row_spacing: int = 1  #: pixels between the points where rows are kept; the rest is interpolated
     shared_rays: bool = False  #: the same rays from all of these: a smooth shade instead of noise
     record_error: float | None = None  #: relative RMS error that rows kept where they are needed, instead of on a grid,
@@ -42,7 +43,7 @@ RECORDS = replace(PREVIEW, record_error=0.01, rays_per_bounce_row=256)
 
 #: The same, packed so that a frame takes milliseconds. Lights that an artist sets lose a third to all of what plausible
 #: lights lose, among which are beams on few cells; what is lost beyond this is noise of the rows.
-LIVE = replace(RECORDS, packing_error=0.02)
+LIVE = replace(RECORDS, rest_bounce_rays=1024, packing_error=0.02)
 
 #: For a close look at what lives on.
 LIVE_FINE = replace(
@@ -58,6 +59,7 @@ def coarse(quality: Quality) -> Quality:
         n_gather=min(quality.n_gather, 4_096),
         rays_per_row=min(quality.rays_per_row, 64),
         rays_per_bounce_row=min(quality.rays_per_bounce_row, 16),
+        rest_bounce_rays=None,
         row_spacing=max(quality.row_spacing, 8),
         shared_rays=True,
         record_error=None,

@@ -22,7 +22,16 @@ from icheat_usd.session.content_keys import ShotKeys, shot_keys
 from icheat_usd.session.disk_cache import DiskCache, Shelf
 from icheat_usd.session.quality import Quality
 from icheat_usd.tracing import Tracer, build_tracer
-from icheat_usd.transport import Bounces, CellLight, HeldBack, Transport, build_bounces, build_transport, light_cells
+from icheat_usd.transport import (
+    Bounces,
+    CellLight,
+    HeldBack,
+    Transport,
+    build_bounces,
+    build_transport,
+    light_cells,
+    more_bounces,
+)
 from icheat_usd.transport.packed import PackedTransport
 from icheat_usd.transport.packing import pack
 from icheat_usd.transport.progressive import build_transports
@@ -225,6 +234,25 @@ class ShotParts:
             )
 
         return self._kept("bounces", ("gather",), make)
+
+    @property
+    def has_rest_bounces(self) -> bool:
+        """Whether the quality asks for other bounces of live lights at rest."""
+        return (self.quality.rest_bounce_rays or 0) > self.quality.rays_per_bounce_row
+
+    @cached_property
+    def rest_bounces(self) -> Bounces:
+        """The same by more rays, for live lights at rest; `bounces` themselves where the quality asks for no more."""
+        if not self.has_rest_bounces:
+            return self.bounces
+        rays, more = self.quality.rays_per_bounce_row, self.quality.rest_bounce_rays
+        assert more is not None
+
+        def make(_: Shelf | None) -> Bounces:
+            scene = self.snapshot, self.tracer, self.gather
+            return more_bounces(*scene, self.bounces, rays, more - rays, seed=self.quality.seed, progress=self.progress)
+
+        return self._kept("rest_bounces", ("bounces",), make)
 
     @cached_property
     def cell_light(self) -> CellLight:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -83,6 +83,24 @@ def build_bounces(
     albedo = np.empty((gather.n, 3), np.float32)
     row_kernels.mean_over_segments(gather.cell_begin, effective_albedo(gather.patch_points), albedo)
     return Bounces(rows.cells, albedo, few.cells)
+
+
+def more_bounces(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    gather: GatherSamples,
+    bounces: Bounces,
+    n_rays: int,
+    n_more: int,
+    *,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Bounces:
+    """Bounces whose rows were measured with `n_rays` rays, by `n_more` others besides; `few` stays."""
+    points = gather.patch_points, gather.cell_begin, gather.number
+    builder = RowBuilder(snapshot, tracer, gather, seed)
+    more = builder.measure(*points, n_more, 4, progress, "more bounce rays")
+    return replace(bounces, rows=MeasuredRows(bounces.rows, n_rays).continued(more).cells)
 
 
 def solve_bounces(bounces: Bounces, direct: F32, n_bounces: int) -> F32:

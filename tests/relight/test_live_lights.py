@@ -13,7 +13,7 @@ from icheat_usd.lighting.change import LightError, texture_image
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import LightKind, SceneSnapshot
 from icheat_usd.session.seen_light import SeenLight
-from icheat_usd.transport import light_cells
+from icheat_usd.transport import light_cells, more_bounces
 from tests.pipeline import Pipeline
 from tests.scenes import (
     Image,
@@ -107,6 +107,32 @@ def test_a_dome_that_was_turned_about_ends_like_one_that_always_stood_so(scene: 
     there = settle(build(scene, room(RECT, SPHERE, replace(DOME, to_world=turned))))
     np.testing.assert_array_equal(lights.radiance[2], there.radiance[2])
     np.testing.assert_array_equal(lights.view_direct[2], there.view_direct[2])
+
+
+def test_bounces_of_more_rays_show_at_rest_whenever_they_come(scene: Pipeline) -> None:
+    """Before a light is at rest, while it is on its way there, and after; what does not bounce stays."""
+    more = more_bounces(scene.snapshot, scene.tracer, scene.gather, scene.bounces, 64, 192)
+    at_once, at_rest, between = (build(scene) for _ in range(3))
+    at_once.take_bounces(more)
+    before = settle(at_rest).radiance.copy()
+    at_rest.take_bounces(more)
+    first, look = between.radiance[0].copy(), between.view_direct.copy()
+    between.take_bounces(more)
+    np.testing.assert_array_equal(between.radiance[0], first)
+    np.testing.assert_array_equal(between.view_direct, look)
+    for _ in range(12):
+        assert between.refine()
+    between.take_bounces(more)
+    expected = settle(at_once)
+    for lights in (settle(at_rest), settle(between)):
+        np.testing.assert_array_equal(lights.radiance, expected.radiance)
+        np.testing.assert_array_equal(lights.view_direct, expected.view_direct)
+    assert (expected.radiance != before).any(axis=(1, 2)).all()
+    lights = at_rest
+    lights.change(0, to_world=moved(RECT).to_world)
+    there = build(scene, room(moved(RECT), SPHERE, DOME))
+    there.take_bounces(more)
+    np.testing.assert_array_equal(settle(lights).radiance, settle(there).radiance)
 
 
 def test_one_light_s_change_leaves_the_others_alone(scene: Pipeline) -> None:

@@ -104,9 +104,10 @@ def test_geometry_materials_and_the_tracer_are_in_every_key_but_the_lights() -> 
         ("record_share", 0.5, set()),
         ("packing_error", 0.1, {"packed"}),
         ("n_bounces", 2, {"cell_light"}),
-        ("rays_per_bounce_row", 16, {"bounces", "cell_light", "training", "packed"}),
+        ("rays_per_bounce_row", 16, {"bounces", "rest_bounces", "cell_light", "training", "packed"}),
+        ("rest_bounce_rays", 64, {"rest_bounces"}),
         ("dome_samples", 3, {"view_light"}),
-        ("n_gather", 64, {"gather", "bounces", "training", "transport", "packed", "cell_light"}),
+        ("n_gather", 64, {"gather", "bounces", "rest_bounces", "training", "transport", "packed", "cell_light"}),
         ("seed", 1, ALL - {"scene", "lights"}),
     ],
 )

@@ -112,6 +112,26 @@ def test_gains_and_amounts_at_rest_are_sums_of_images(
     assert n >= (5 if name == "light" else 2)
 
 
+def test_bounces_of_more_rays_come_once_lights_are_at_rest_and_are_kept_on_disk(stage: Path) -> None:
+    """What is shown at rest is what a session shows whose bounces had the rays at once, but for their sequence."""
+    images = {}
+    for rays in (None, 256):
+        with LiveSession.open(stage, quality=replace(QUALITY, rest_bounce_rays=rays)) as live:
+            live.wait("full")
+            full = live.frame()
+            live.wait("rest")
+            images[rays] = live.frame()
+            np.testing.assert_allclose(images[rays].mean(), full.mean(), rtol=0.2)
+    with LiveSession.open(stage, quality=replace(QUALITY, rest_bounce_rays=256)) as live:
+        live.wait("rest")
+        np.testing.assert_array_equal(live.frame(), images[256])
+    with LiveSession.open(stage, quality=replace(QUALITY, rays_per_bounce_row=4096)) as live:
+        live.wait("rest")
+        true = live.frame()
+    off = {rays: np.linalg.norm(image - true) for rays, image in images.items()}
+    assert 0 < off[256] < 0.6 * off[None]
+
+
 def test_film_has_the_layers_of_a_relight_and_the_same_image(live: LiveSession) -> None:
     film = live.film()
     np.testing.assert_allclose(film.layer("beauty"), live.frame(), rtol=1e-5, atol=1e-6)

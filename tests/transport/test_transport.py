@@ -10,7 +10,7 @@ from icheat_usd.lighting import build_light_sampler
 from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct, gather_samples, view_samples
 from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.tracing import Tracer, build_tracer
-from icheat_usd.transport import Bounces, Transport, build_bounces, build_transport, solve_bounces
+from icheat_usd.transport import Bounces, Transport, build_bounces, build_transport, more_bounces, solve_bounces
 from tests.scenes import (
     Light,
     Material,
@@ -69,6 +69,20 @@ def test_light_on_the_move_has_the_first_rays_of_the_bounces_and_the_others_are_
     assert few.few is few.rows
     # Four times the rays: half the noise.
     assert np.linalg.norm(dense - true) < 0.6 * np.linalg.norm(of_few - true)
+
+
+def test_bounces_by_more_rays_are_closer_to_the_truth_and_leave_light_on_the_move_alone() -> None:
+    scene = cornell(8, 8)
+    tracer, _, gather = prepare(scene, 400)
+    one_each = np.eye(gather.n, dtype=np.float32)
+    true = build_bounces(scene, tracer, gather, rays_per_row=4096, seed=1).rows.matmul(one_each)
+    bounces = build_bounces(scene, tracer, gather, rays_per_row=256)
+    more = more_bounces(scene, tracer, gather, bounces, 256, 768)
+    assert more.few is bounces.few and more.albedo is bounces.albedo
+    before, after = (np.linalg.norm(rows.matmul(one_each) - true) for rows in (bounces.rows, more.rows))
+    assert after < 0.6 * before  # four times the rays: half the noise
+    inside = gather.points.side == 0
+    np.testing.assert_allclose(more.rows.row_sums()[inside].mean(), bounces.rows.row_sums()[inside].mean(), rtol=1e-3)
 
 
 def test_parallel_unit_squares_one_apart_see_a_fifth_of_each_other() -> None:

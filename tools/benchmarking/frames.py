@@ -53,7 +53,13 @@ REST_SECONDS = 60.0
 MOST_SECONDS = 240.0
 _LARGE = {"width": 1920, "height": 1080}
 #: A large image is measured for its frames, not for its build, which has fewer rays.
-_LARGE_RAYS = {"record_rays": 512, "rays_per_bounce_row": 32, "light_samples": 4, "dome_samples": 4}
+_LARGE_RAYS = {
+    "record_rays": 512,
+    "rays_per_bounce_row": 32,
+    "rest_bounce_rays": None,
+    "light_samples": 4,
+    "dome_samples": 4,
+}
 #: Changes whose images depend on what was shown before: a light that moves is not at rest.
 _FROM_BEFORE = ("light move", "64 edits: light move", f"{MIXED}: light move", DOME)
 

@@ -109,7 +109,7 @@ class Parts:
     @cached_property
     def lights(self) -> LiveLights:
         quality = self.effort.settings()
-        return LiveLights(
+        lights = LiveLights(
             self.snapshot,
             self.tracer,
             self.view,
@@ -120,6 +120,8 @@ class Parts:
             dome_samples=quality.dome_samples,
             seed=quality.seed,
         )
+        lights.take_bounces(self._shot.rest_bounces)
+        return lights
 
     @cached_property
     def live(self) -> LiveRelighter:
