@@ -112,20 +112,26 @@ def test_gains_and_amounts_at_rest_are_sums_of_images(
     assert n >= (5 if name == "light" else 2)
 
 
-def test_bounces_of_more_rays_come_once_lights_are_at_rest_and_are_kept_on_disk(stage: Path) -> None:
+@pytest.mark.parametrize("quality", [QUALITY, PACKED], ids=["exact", "packed"])
+def test_bounces_of_more_rays_come_once_lights_are_at_rest_and_are_kept_on_disk(stage: Path, quality: Quality) -> None:
     """What is shown at rest is what a session shows whose bounces had the rays at once, but for their sequence."""
     images = {}
     for rays in (None, 256):
-        with LiveSession.open(stage, quality=replace(QUALITY, rest_bounce_rays=rays)) as live:
+        with LiveSession.open(stage, quality=replace(quality, rest_bounce_rays=rays)) as live:
             live.wait("full")
             full = live.frame()
             live.wait("rest")
             images[rays] = live.frame()
             np.testing.assert_allclose(images[rays].mean(), full.mean(), rtol=0.2)
-    with LiveSession.open(stage, quality=replace(QUALITY, rest_bounce_rays=256)) as live:
+    with LiveSession.open(stage, quality=replace(quality, rest_bounce_rays=256)) as live:
         live.wait("rest")
         np.testing.assert_array_equal(live.frame(), images[256])
-    with LiveSession.open(stage, quality=replace(QUALITY, rays_per_bounce_row=4096)) as live:
+        live.set_light(next(iter(live.lights)), move=(0.05, 0, 0))
+        live.frame()
+        live.undo()
+        live.wait("rest")
+        np.testing.assert_array_equal(live.frame(), images[256])
+    with LiveSession.open(stage, quality=replace(quality, rays_per_bounce_row=4096)) as live:
         live.wait("rest")
         true = live.frame()
     off = {rays: np.linalg.norm(image - true) for rays, image in images.items()}
