@@ -26,7 +26,7 @@ from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import CloserLook
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, I32, I64, LightKind, SceneSnapshot
+from icheat_usd.scene import F32, I32, I64, Bool, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.transport import Bounces
@@ -38,6 +38,10 @@ from icheat_usd.transport.sparse import SparseRows
 _SMOOTH = 0.3
 
 _RAYS_PER_STEP = 1 << 16  # of the general way
+
+# Places nearer to a light than so many of its extents are lit by what samples solid angles: of points spread evenly
+# over a light, those next to a place are too few and too bright.
+_NEAR = 1.0
 
 _PARTS = 4  # bounces of a light that moves are found for one of so many cells at a time
 
@@ -208,6 +212,16 @@ def _tile_order(view: ViewSamples) -> I64:
     return np.argsort(key, kind="stable")
 
 
+def _is_near(position: F32, table: F32, distant: bool) -> Bool:
+    """Which places (n, 3) are near a light of these points."""
+    if distant:
+        return np.zeros(len(position), np.bool_)
+    low, high = table[:, :3].min(axis=0), table[:, :3].max(axis=0)
+    gap = np.maximum(np.maximum(low - position, position - high), 0)
+    near: Bool = np.linalg.norm(gap, axis=1) < _NEAR * np.linalg.norm(high - low)
+    return near
+
+
 class ExactBounces:
     """The bounces of one light as `solve_bounces` has them, one per step."""
 
@@ -266,7 +280,10 @@ class MovingLight:
     ) -> None:
         self._around, self._alone, self._seed, self._rounds = around, alone, seed, light_samples
         self._shining = light_points(alone, seed)
-        self._step = self._n_found = 0
+        self._step = self._n_found = self._n_near = 0
+        self._near: I64 | None = None  # cells next to the light, from the last round on
+        self._exposed: I64 | None = None  # view samples next to it or with narrow lobes, once the bounces are done
+        self._sampler: LightSampler | None = None
         self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self.following: Following | None = None  #: set from before to spare work
@@ -301,16 +318,20 @@ class MovingLight:
         turn, at_view = divmod(self._step, 2)
         self._step += 1
         if turn >= self._rounds:
+            if self._light_near_cells():
+                return True
             direct = self._cells / np.float32(self._rounds)
             self._exact = self._exact or ExactBounces(around, direct)
             if self._exact.step(radiance):
                 return True
             self.direct = direct
-            return self._find_highlights(view_direct)
+            return self._light_exposed(view_direct)
         places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
         found = np.empty((places.n, 3), np.float32)
         shadows = around.shadows_of(self._alone)
-        direct_at(self._alone, shadows, places, self._seed, False, found, turn, shining=self._shining)
+        # Points of its own for every round: what lies next to a light sees how far they are apart.
+        seed = int(hash_combine(self._seed, turn)) & 0x7FFFFFFF
+        direct_at(self._alone, shadows, places, seed, False, found, turn, shining=light_points(self._alone, seed))
         into += found if at_view else around.cell_means(found)
         share = np.float32(1.0 / (turn + 1))
         if at_view:
@@ -325,19 +346,45 @@ class MovingLight:
         """Bounces are to be solved with other rows."""
         self._exact = None
 
-    def _find_highlights(self, view_direct: F32) -> bool:
-        """Narrow lobes of some more view samples; False after the last."""
-        view, first = self._around.view, self._n_found
-        rows = self._around.smooth[first : first + max(1, _RAYS_PER_STEP // self._rounds)]
+    def _light_near_cells(self) -> bool:
+        """Light some of the cells next to the light in the general way; False once all are."""
+        gather, n = self._around.gather, self._rounds
+        if self._near is None:
+            self._near = np.flatnonzero(_is_near(gather.points.position, *self._shining))
+            self._sampler = build_light_sampler(self._alone)
+        first = self._n_near
+        if first >= len(self._near):
+            return False
+        assert self._sampler is not None
+        count = np.diff(gather.cell_begin)[self._near[first:]]
+        some = self._near[first : first + max(1, int(np.searchsorted(np.cumsum(count), _RAYS_PER_STEP // n)))]
+        self._n_near += len(some)
+        begin = np.concatenate([[0], np.cumsum(count[: len(some)])]).astype(np.int64)
+        patches = np.repeat(gather.cell_begin[some] - begin[:-1], count[: len(some)]) + np.arange(begin[-1])
+        points, seed = take_points(gather.patch_points, patches), int(hash_combine(self._seed, first)) & 0x7FFFFFFF
+        arriving = irradiance(self._alone, self._around.tracer, self._sampler, points, seed, n)[0]
+        means = np.empty((len(some), 3), np.float32)
+        mean_over_segments(begin, arriving * self._around.patch_tint[patches], means)
+        self._cells[some] = means * np.float32(n)  # as the sum of all rounds
+        return True
+
+    def _light_exposed(self, view_direct: F32) -> bool:
+        """Light some more of the view samples next to the light or with narrow lobes; False after the last."""
+        around, first = self._around, self._n_found
+        view = around.view
+        if self._exposed is None:
+            near = np.flatnonzero(_is_near(view.points.position, *self._shining))
+            self._exposed = np.union1d(near, around.smooth)
+        rows = self._exposed[first : first + max(1, _RAYS_PER_STEP // self._rounds)]
         if len(rows):
+            assert self._sampler is not None
             points = take_points(view.points, rows)
-            sampler = build_light_sampler(self._alone)
             seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
             view_direct[rows] = reflected_direct(
-                self._alone, self._around.tracer, sampler, points, view.to_eye[rows], seed, self._rounds
+                self._alone, around.tracer, self._sampler, points, view.to_eye[rows], seed, self._rounds
             )[0]
         self._n_found += len(rows)
-        return self._n_found < len(self._around.smooth)
+        return self._n_found < len(self._exposed)
 
 
 class AnyLight:

@@ -189,6 +189,23 @@ def test_at_rest_the_light_is_that_of_the_slow_way(scene: Pipeline) -> None:
         np.testing.assert_allclose(lights.view_direct[light].mean(0), direct[light].mean(0), rtol=0.06)
 
 
+def test_next_to_a_light_there_is_as_little_noise_as_elsewhere() -> None:
+    """A large light just off a wall: points spread evenly over it leave 40 % on the wall after as many rays."""
+    standing = (translation(0.97, 0, 0) @ rotation((0, 1, 0), -90))[:3].astype(np.float32)
+    near = Light(LightKind.RECT, (5, 5, 5), standing, (1.0, 1.0), path="/near")
+    camera = look_at((0, 0, 3.9), fov=39.3, width=24, height=18)
+    wall = Pipeline(make_snapshot(cornell_meshes(), lights=[near], camera=camera), n_gather=1000, bounce_rays=16)
+    parts = wall.snapshot, wall.tracer, wall.view, wall.gather, wall.bounces
+    lights = settle(LiveLights(*parts, n_bounces=1, light_samples=16, seed=3))
+    scene, points = (wall.snapshot, wall.tracer), wall.view.points
+    cells = light_cells(*scene, wall.gather, wall.bounces, n_bounces=1, light_samples=1024).radiance[0]
+    off = (lights.radiance[0] - cells) ** 2 * wall.gather.area[:, None]
+    assert np.sqrt(off.sum() / (cells**2 * wall.gather.area[:, None]).sum()) < 0.03
+    sampler = build_light_sampler(wall.snapshot, wall.tracer, points)
+    direct = reflected_direct(*scene, sampler, points, wall.view.to_eye, 5, 1024)[0]
+    assert np.sqrt(((lights.view_direct[0] - direct) ** 2).sum() / (direct**2).sum()) < 0.03
+
+
 def test_any_number_of_threads_gives_the_same_light(scene: Pipeline) -> None:
     """At rest, and for a dome at first look."""
     without_dome = room(RECT, SPHERE)

@@ -49,6 +49,8 @@ class ErrorSettings:
     hit_pixels: int = 200  #: for the comparison with light at true hits
     hit_rays: int = 1024
     sheet_rays: int = 256  #: per pixel of the images to look at
+    bounce_rays: int = 1024
+    light_samples: int = 64
     n_bounces: int = 16
     tolerances: tuple[float, ...] = (0.2, 0.1, 0.05, 0.025)  #: of packing, for the curve of error against speed
     shares: tuple[float, ...] = (0.05, 0.1)  #: of the view samples that rows are kept at, for another such curve
@@ -105,10 +107,9 @@ def converged_references(parts: Parts, settings: ErrorSettings) -> References:
     same, other, radiance = [], [], []
     for half in (1, 2):
         seed = settings.seed + 1000 * half
-        bounces = build_bounces(parts.snapshot, parts.tracer, parts.gather, seed=seed)
-        b = light_cells(
-            parts.snapshot, parts.tracer, parts.gather, bounces, n_bounces=settings.n_bounces, seed=seed
-        ).radiance
+        scene, n = (parts.snapshot, parts.tracer, parts.gather), settings.light_samples
+        bounces = build_bounces(*scene, rays_per_row=settings.bounce_rays, seed=seed)
+        b = light_cells(*scene, bounces, n_bounces=settings.n_bounces, light_samples=n, seed=seed).radiance
         both = np.concatenate([own, b])
         products = converged_products(parts.snapshot, parts.tracer, parts.gather, view, settings.rays, seed, both)
         pixels = np.stack([probe.to_pixels(product) for product in products])
