@@ -157,6 +157,22 @@ class Surroundings:
         else:
             self.quick_bounces.follow(radiance, before, direct, radiance, part)
 
+    def lit_cells(self, alone: SceneSnapshot, sampler: LightSampler, cells: I64, seed: int, n: int) -> F32:
+        """What some cells (m,) reflect of the light of a one-light snapshot, `n` shadow rays a patch point: (m, 3)."""
+        begin, size = self.gather.cell_begin[cells], np.diff(self.gather.cell_begin)[cells]
+        ends = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+        patches = np.repeat(begin - ends[:-1], size) + np.arange(ends[-1])
+        points = take_points(self.gather.patch_points, patches)
+        arriving = irradiance(alone, self.tracer, sampler, points, seed, n)[0]
+        means = np.empty((len(cells), 3), np.float32)
+        mean_over_segments(ends, arriving * self.patch_tint[patches], means)
+        return means
+
+    def lit_view(self, alone: SceneSnapshot, sampler: LightSampler, samples: I64, seed: int, n: int) -> F32:
+        """The same for some view samples (m,): (m, 3)."""
+        points = take_points(self.view.points, samples)
+        return reflected_direct(alone, self.tracer, sampler, points, self.view.to_eye[samples], seed, n)[0]
+
     def cell_means(self, of_patches: F32) -> F32:
         """Means over the patch points of each cell."""
         out = np.empty((self.gather.n, 3), np.float32)
@@ -356,16 +372,12 @@ class MovingLight:
         if first >= len(self._near):
             return False
         assert self._sampler is not None
-        count = np.diff(gather.cell_begin)[self._near[first:]]
-        some = self._near[first : first + max(1, int(np.searchsorted(np.cumsum(count), _RAYS_PER_STEP // n)))]
+        ends = np.cumsum(np.diff(gather.cell_begin)[self._near[first:]])
+        some = self._near[first : first + max(1, int(np.searchsorted(ends, _RAYS_PER_STEP // n)))]
         self._n_near += len(some)
-        begin = np.concatenate([[0], np.cumsum(count[: len(some)])]).astype(np.int64)
-        patches = np.repeat(gather.cell_begin[some] - begin[:-1], count[: len(some)]) + np.arange(begin[-1])
-        points, seed = take_points(gather.patch_points, patches), int(hash_combine(self._seed, first)) & 0x7FFFFFFF
-        arriving = irradiance(self._alone, self._around.tracer, self._sampler, points, seed, n)[0]
-        means = np.empty((len(some), 3), np.float32)
-        mean_over_segments(begin, arriving * self._around.patch_tint[patches], means)
-        self._cells[some] = means * np.float32(n)  # as the sum of all rounds
+        seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
+        # as the sum of all rounds
+        self._cells[some] = self._around.lit_cells(self._alone, self._sampler, some, seed, n) * np.float32(n)
         return True
 
     def _light_exposed(self, view_direct: F32) -> bool:
@@ -378,11 +390,8 @@ class MovingLight:
         rows = self._exposed[first : first + max(1, _RAYS_PER_STEP // self._rounds)]
         if len(rows):
             assert self._sampler is not None
-            points = take_points(view.points, rows)
             seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
-            view_direct[rows] = reflected_direct(
-                self._alone, around.tracer, self._sampler, points, view.to_eye[rows], seed, self._rounds
-            )[0]
+            view_direct[rows] = around.lit_view(self._alone, self._sampler, rows, seed, self._rounds)
         self._n_found += len(rows)
         return self._n_found < len(self._exposed)
 
@@ -480,21 +489,13 @@ class AnyLight:
         first = self._cell
         wanted = int(begin[first]) + max(1, _RAYS_PER_STEP // self._n_cells)
         last = min(max(int(np.searchsorted(begin, wanted)), first + 1), around.gather.n)
-        patches = np.arange(begin[first], begin[last])
-        points = take_points(around.gather.patch_points, patches)
-        seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
-        arriving = irradiance(self._alone, around.tracer, self._sampler(0), points, seed, self._n_cells)[0]
-        mean_over_segments(
-            begin[first : last + 1] - begin[first], arriving * around.patch_tint[patches], self._cells[first:last]
-        )
+        cells, seed = np.arange(first, last), int(hash_combine(self._seed, first)) & 0x7FFFFFFF
+        self._cells[first:last] = around.lit_cells(self._alone, self._sampler(0), cells, seed, self._n_cells)
         self._cell = last
 
     def _light_view(self) -> None:
         around, first = self._around, self._sample
         last = min(first + max(1, _RAYS_PER_STEP // self._n_view), around.view.n)
-        points = take_points(around.view.points, slice(first, last))
-        seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
-        self._view[first:last] = reflected_direct(
-            self._alone, around.tracer, self._sampler(1), points, around.view.to_eye[first:last], seed, self._n_view
-        )[0]
+        samples, seed = np.arange(first, last), int(hash_combine(self._seed, first)) & 0x7FFFFFFF
+        self._view[first:last] = around.lit_view(self._alone, self._sampler(1), samples, seed, self._n_view)
         self._sample = last
