@@ -113,8 +113,8 @@ def test_gains_and_amounts_at_rest_are_sums_of_images(
 
 
 @pytest.mark.parametrize("quality", [QUALITY, PACKED], ids=["exact", "packed"])
-def test_bounces_of_more_rays_come_once_lights_are_at_rest_and_are_kept_on_disk(stage: Path, quality: Quality) -> None:
-    """What is shown at rest is what a session shows whose bounces had the rays at once, but for their sequence."""
+def test_bounces_of_more_rays_come_once_lights_are_at_rest(stage: Path, quality: Quality) -> None:
+    """They are nearer to the truth, and the same bits in another session and after a light was moved and put back."""
     images = {}
     for rays in (None, 256):
         with LiveSession.open(stage, quality=replace(quality, rest_bounce_rays=rays)) as live:
