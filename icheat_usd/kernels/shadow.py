@@ -28,7 +28,8 @@ from icheat_usd.kernels.simd import address_of, load, multiply_add, plus, produc
 
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
 PLACE, TINT, GLOSS = 9, 3, 12  #: columns of the tables of places
-PART = 4  #: one of so many places of a run sends a ray where that is enough
+PART = 8  #: one of so many places of a run sends a ray where all have met the same so far, and that is enough
+_MIXED_PART = 4  # the same of other runs, and of those that nothing is known of
 STATES = 4  #: a place knows STATES * point + state
 _RUNS = 16  # of a task, whose rays fill packets together
 _INVALID = np.uint32(0xFFFFFFFF)
@@ -112,10 +113,14 @@ def _ask(
     """Which places of a run send a ray at first, and what the others know; `chosen` is -1 where there is no point."""
     # Loops without branches, which the compiler turns into vectors.
     if phase >= 0:
+        met = 0
+        for j in range(len(known)):
+            met |= 1 << (known[j] & 3) if known[j] >= 0 else 0
+        part = (PART if met & (met - 1) == 0 else _MIXED_PART) - 1
         for j in range(len(known)):
             same = known[j] >> 2 == chosen[j]
             state[j] = known[j] & 3 if same and chosen[j] >= 0 else _BLOCKED
-            asks[j] = 1 if chosen[j] >= 0 and (not same or (j & (PART - 1)) == phase) else 0
+            asks[j] = 1 if chosen[j] >= 0 and (not same or (j ^ phase) & part == 0) else 0
         if len(turned) > 0:
             for j in range(len(known)):
                 asks[j] |= turned[chosen[j]] if chosen[j] >= 0 else 0
@@ -124,7 +129,7 @@ def _ask(
     else:
         for j in range(RUN):
             state[j] = _BLOCKED
-            asks[j] = 1 if chosen[j] >= 0 and (not share_rays or (j & (PART - 1)) == 0) else 0
+            asks[j] = 1 if chosen[j] >= 0 and (not share_rays or (j & (_MIXED_PART - 1)) == 0) else 0
 
 
 @kernel
@@ -146,7 +151,7 @@ def _agree(
     for q in range(len(rows)):
         common = common if state[rows[q] - offset] == common else _THROUGH
     for j in range(RUN):
-        if chosen[j] >= 0 and (j & (PART - 1)) != 0:
+        if chosen[j] >= 0 and (j & (_MIXED_PART - 1)) != 0:
             state[j] = common
     return bool(common != _THROUGH)
 
@@ -186,6 +191,33 @@ def _meet(
                 asks[k, j] = 1 if chosen[k, j] >= 0 and asks[k, j] == 0 else 0
             count = _append_rows(asks[k], offset, count, others)
     _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, others, count, every_state)
+
+
+@kernel
+def count_turned(
+    before: np.ndarray, known: np.ndarray, phase: int, share: float, least: int, turned: np.ndarray
+) -> None:
+    """Find points of a light whose rays mostly meet something else than in the look before.
+
+    Parameters
+    ----------
+    before, known : (n,) int16
+        What each place has found in the look before and in this one, as for `light_places`.
+    phase : int
+        Of the places that sent a ray, whatever others saw.
+    share, least
+        Of the places that see a point now or did before so many, and so many of them, must have met something else.
+    turned : (n_points,) int32, set
+        1 for such points.
+    """
+    looks, others = np.zeros(len(turned), np.int32), np.zeros(len(turned), np.int32)
+    for i in range(phase, len(known), PART):
+        old, new = np.int32(before[i]), np.int32(known[i])
+        if old >= 0 and new >= 0 and old >> 2 == new >> 2 and (old | new) & 3 != _BLOCKED:
+            looks[new >> 2] += 1
+            others[new >> 2] += 1 if old != new else 0
+    for point in range(len(turned)):
+        turned[point] = 1 if looks[point] >= least and others[point] > share * looks[point] else 0
 
 
 @kernel

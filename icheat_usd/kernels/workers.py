@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar, copy_context
+from functools import cache
 from typing import TypeVar
 
 import numba
@@ -15,6 +16,7 @@ from icheat_usd.kernels._jit import kernels_may_overlap
 Made = TypeVar("Made")
 
 _MOST_AT_ONCE = 4  # pieces, each with an equal share of the workers: each holds memory
+_aside: ContextVar[tuple[Future[None], int] | None] = ContextVar("_aside", default=None)  # pieces, and all workers
 _is_one_of_many: ContextVar[bool] = ContextVar("_is_one_of_many", default=False)
 
 
@@ -56,6 +58,73 @@ def overlapping(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
         finally:
             for future in waiting:
                 future.cancel()
+
+
+def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Made:
+    """Do some work while another thread does pieces that do not depend on it; at last this one helps with the pieces.
+
+    For frames, where a chain of short steps leaves workers idle: each of the two threads has half of the workers
+    until the pieces are done, of which the work hears where it asks `take_back`. Where kernels may not overlap, all is
+    done one after the other.
+
+    Parameters
+    ----------
+    pieces
+        Independent of one another, of a fraction of a millisecond and more.
+
+    Raises
+    ------
+    Exception
+        Of the work, else of a piece; every piece that was begun has then ended.
+    """
+    start_workers()
+    n_threads = numba.get_num_threads()
+    left = deque(pieces)
+    if n_threads < 2 or _is_one_of_many.get() or not kernels_may_overlap():
+        made = work()
+        _do_what_is_left(left)
+        return made
+    aside = _beside().submit(copy_context().run, _with_workers, n_threads // 2, left)
+    numba.set_num_threads(n_threads - n_threads // 2)
+    outer = _aside.set((aside, n_threads))
+    try:
+        made = work()
+        _do_what_is_left(left)
+    finally:
+        left.clear()
+        wait([aside])
+        _aside.reset(outer)
+        numba.set_num_threads(n_threads)
+    aside.result()
+    return made
+
+
+def take_back() -> None:
+    """Within the work of `beside`: have all workers again from here on, if the pieces are done."""
+    aside = _aside.get()
+    if aside is not None and aside[0].done():
+        numba.set_num_threads(aside[1])
+
+
+@cache
+def _beside() -> ThreadPoolExecutor:
+    """The other thread, which stays: to start one takes as long as a piece."""
+    return ThreadPoolExecutor(1, "icheat beside")
+
+
+def _with_workers(n: int, left: deque[Callable[[], None]]) -> None:
+    numba.set_num_threads(n)
+    _do_what_is_left(left)
+
+
+def _do_what_is_left(left: deque[Callable[[], None]]) -> None:
+    """Take pieces until there are none; another thread may do the same."""
+    while True:
+        try:
+            piece = left.popleft()
+        except IndexError:
+            return
+        piece()
 
 
 def _one_of_many(make: Callable[[], Made]) -> Made:

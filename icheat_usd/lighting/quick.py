@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers
-from icheat_usd.kernels.shadow import GLOSS, PART, STATES, STRIDE, light_places
+from icheat_usd.kernels.shadow import GLOSS, PART, STRIDE, count_turned, light_places
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.kernels.shaping import shape_places
 from icheat_usd.lighting.controls import darken, emission_frame, without
@@ -25,10 +27,11 @@ _ALPHA = 6  # column of the tables of lobes
 _POINT_COLUMNS = [0, 1, 2, 3, 4, 5, 9]  # of the table of a light's points: place, normal, what it brings
 _CANDIDATES = 4  # points of the light that a place looks at
 _FEW_CANDIDATES = 2  # where places share rays
+_PIECE = 256  # runs of a look that a thread takes at a time
 _NO_POINTS = np.zeros(0, np.int32)
-# Share of the places that look at a point from which it counts as turned, and how many places there must be. Some see
-# nothing of a point on either side of the surface that it crosses.
-_TURNED_SHARE, _LEAST_LOOKS = 0.25, 4
+# Share of the places that see a point now or did before from which it counts as turned, and how many places there must
+# be.
+_TURNED_SHARE, _LEAST_LOOKS = 0.5, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +121,8 @@ class LastLook:
         before : (n,)
             What `known` was then.
         """
-        phase = (self.n - 1) % PART  # of the places that sent a ray, whatever others saw
-        old, new = before[phase::PART], self.known[phase::PART]
-        same = (old >= 0) & (new >= 0) & (old // STATES == new // STATES)
-        old, new = old[same], new[same]
-        looks = np.bincount(new // STATES, minlength=n_points)
-        other = np.bincount(new[old != new] // STATES, minlength=n_points)
-        turned: I32 = ((looks >= _LEAST_LOOKS) & (other > _TURNED_SHARE * looks)).astype(np.int32)
+        turned = np.zeros(n_points, np.int32)
+        count_turned(before, self.known, (self.n - 1) % PART, _TURNED_SHARE, _LEAST_LOOKS, turned)
         return turned
 
     def forget(self, runs: I64) -> None:
@@ -189,6 +187,145 @@ def _lobes(points: SurfacePoints, to_eye: F32) -> F32:
     return table
 
 
+class LightGroups(NamedTuple):
+    """Points of a light as successive places look at them; see `kernels.shadow.light_places`."""
+
+    points: F32
+    first: I32
+    colors: F32
+
+
+class Shining:
+    """Points of a light as `lighting.points.light_points` has them, and what looks at them need."""
+
+    def __init__(self, table: F32, distant: bool) -> None:
+        self.table, self.distant = table, distant
+        least, largest = table.min(axis=0), table.max(axis=0)
+        #: Least and largest place and normal of the points, (4, 3).
+        self.bounds: F32 = np.stack([least[:3], largest[:3], least[3:6], largest[3:6]])
+        colors = table[:, 6:9]
+        self._colors = np.ascontiguousarray(colors if (colors != 1.0).any() else colors[:0])
+        self._points = np.ascontiguousarray(table[:, _POINT_COLUMNS])
+
+    def groups(self, candidates: int, turn: int) -> LightGroups:
+        """Groups of so many points; successive places look at different parts of the light.
+
+        In as many turns as there are groups a place looks at every point once.
+        """
+        group, first = _order_of_groups(len(self.table), candidates, turn)
+        points = self._points.reshape(-1, candidates, len(_POINT_COLUMNS))[group]
+        return LightGroups(np.ascontiguousarray(points.transpose(1, 2, 0)), first, self._colors)
+
+
+@lru_cache(maxsize=64)
+def _order_of_groups(n_points: int, candidates: int, turn: int) -> tuple[I64, I32]:
+    """Which group of points successive places look at, and the first point of each."""
+    n = n_points // candidates
+    group = (np.arange(n + RUN) * STRIDE ^ turn) & (n - 1)
+    return group, (group * candidates).astype(np.int32)
+
+
+def shining_points(snapshot: SceneSnapshot, seed: int) -> Shining:
+    """Points of the one light of a snapshot."""
+    return Shining(*light_points(snapshot, seed))
+
+
+class Look:
+    """One look from places at the light of a one-light snapshot: run by run, in any order, by one thread or several.
+
+    Parameters
+    ----------
+    seed, share_rays, out, turn, last, turned
+        As `direct_at` has them.
+    shining : Shining
+        Points of the light.
+    """
+
+    def __init__(
+        self,
+        snapshot: SceneSnapshot,
+        shadows: Shadows,
+        places: Places,
+        shining: Shining,
+        seed: int,
+        share_rays: bool,
+        out: F32,
+        turn: int,
+        last: LastLook | None,
+        turned: I32 | None,
+    ) -> None:
+        self._snapshot, self._shadows, self._places, self._shining, self._out = snapshot, shadows, places, shining, out
+        controls = snapshot.controls(0)
+        self._tint, self._gloss = places.tint, places.gloss
+        if controls.diffuse != 1.0:
+            self._tint = places.tint * np.float32(controls.diffuse)
+        if controls.specular != 1.0:
+            self._gloss = places.gloss.copy()
+            self._gloss[:, :_ALPHA] *= np.float32(controls.specular)
+        self._seed, self._share_rays, self._turn = seed, share_rays, turn
+        self._groups = shining.groups(_FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
+        self._through = np.zeros(0 if shadows.passing is None else places.n, np.int32)
+        self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
+        self._turned = _NO_POINTS if turned is None or not turned.any() else turned
+        if last is not None:
+            self._known = last.known
+            self._phase = last.n % PART if last.n else -1
+            last.n += 1
+
+    def pieces(self) -> list[Callable[[], None]]:
+        """All runs, some at a time."""
+        every = np.arange(len(self._places.place), dtype=np.int32)
+        return [partial(self.light, every[first : first + _PIECE]) for first in range(0, len(every), _PIECE)]
+
+    def light(self, runs: I32) -> None:
+        """Find what the places of some runs (n_runs,) reflect, but for what dims it in `finish`."""
+        shadows, places, groups = self._shadows, self._places, self._groups
+        function, opaque = shadows.opaque.address_of("rtcOccluded16")
+        passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
+        light_places(
+            function,
+            shadows.opaque.compiled().arguments if self._share_rays else 0,
+            opaque,
+            passing,
+            groups.points,
+            groups.first,
+            groups.colors,
+            self._shining.bounds,
+            self._shining.distant,
+            self._seed,
+            self._turn,
+            places.bounds,
+            places.place,
+            self._tint,
+            self._gloss,
+            places.lobes,
+            self._share_rays,
+            self._phase,
+            self._known,
+            self._turned,
+            places.row,
+            runs,
+            self._out,
+            self._through,
+        )
+
+    def finish(self) -> None:
+        """Dim what is lit: see-through surfaces, the light's shaping, and surfaces that it does not light."""
+        snapshot, places, out = self._snapshot, self._places, self._out
+        table, distant = self._shining.table, self._shining.distant
+        if len(self._through):
+            rows = np.flatnonzero(self._through != 0)  # of bool, several times as fast
+            origin, end = places.place[rows // RUN, :3, rows % RUN], table[self._through[rows] - 1, :3]
+            direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
+            out[places.row[rows]] *= self._shadows.crossing(snapshot, origin, direction, limit)[:, None]
+        shaping = snapshot.controls(0).shaping
+        if shaping is not None:
+            # The choice among points was made without it, which the mean over choices does not notice.
+            frame = emission_frame(snapshot, 0)
+            shape_places(shaping, *frame, table, distant, places.place, self._known, places.row, out)
+        darken(snapshot, 0, places.instance, out)
+
+
 def direct_at(
     snapshot: SceneSnapshot,
     shadows: Shadows,
@@ -198,7 +335,7 @@ def direct_at(
     out: F32,
     turn: int = 0,
     last: LastLook | None = None,
-    shining: tuple[F32, bool] | None = None,
+    shining: Shining | None = None,
     runs: I32 | None = None,
     turned: I32 | None = None,
 ) -> None:
@@ -214,93 +351,14 @@ def direct_at(
         Without what does not block the light; see `lighting.controls.hidden_instances`.
     last : LastLook, optional
         Of the same light and turn somewhere near: most places take their shadow from it. It is brought up to date.
-    shining : (table, distant), optional
-        What `light_points` has for the snapshot and the seed, if that is known.
+    shining : Shining, optional
+        What `shining_points` has for the snapshot and the seed, if that is known.
     runs : (n_runs,), optional
         Runs of places that are meant, by default all; what others have in `out` means nothing then.
     turned : (n_points,), optional
         What `LastLook.turned_points` found at other places: their rays are sent whatever `last` knows.
     """
-    controls = snapshot.controls(0)
-    tint, gloss = places.tint, places.gloss
-    if controls.diffuse != 1.0:
-        tint = tint * np.float32(controls.diffuse)
-    if controls.specular != 1.0:
-        gloss = gloss.copy()
-        gloss[:, :_ALPHA] *= np.float32(controls.specular)
-    table, distant = shining or light_points(snapshot, seed)
-    groups = light_groups(table, _FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
-    through = np.zeros(0 if shadows.passing is None else places.n, np.int32)
-    function, opaque = shadows.opaque.address_of("rtcOccluded16")
-    passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
-    phase, known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
-    if last is not None:
-        known = last.known
-        phase = last.n % PART if last.n else -1
-        last.n += 1
-    light_places(
-        function,
-        shadows.opaque.compiled().arguments if share_rays else 0,
-        opaque,
-        passing,
-        groups.points,
-        groups.first,
-        groups.colors,
-        light_bounds(table),
-        distant,
-        seed,
-        turn,
-        places.bounds,
-        places.place,
-        tint,
-        gloss,
-        places.lobes,
-        share_rays,
-        phase,
-        known,
-        _NO_POINTS if turned is None or not turned.any() else turned,
-        places.row,
-        np.arange(len(places.place), dtype=np.int32) if runs is None else runs,
-        out,
-        through,
-    )
-    if shadows.passing is not None:
-        rows = np.flatnonzero(through != 0)  # of bool, several times as fast
-        origin, end = places.place[rows // RUN, :3, rows % RUN], table[through[rows] - 1, :3]
-        direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
-        out[places.row[rows]] *= shadows.crossing(snapshot, origin, direction, limit)[:, None]
-    if controls.shaping is not None:
-        # The choice among points was made without it, which the mean over choices does not notice.
-        frame = emission_frame(snapshot, 0)
-        shape_places(controls.shaping, *frame, table, distant, places.place, known, places.row, out)
-    darken(snapshot, 0, places.instance, out)
-
-
-def light_bounds(table: F32) -> F32:
-    """Least and largest place and normal (4, 3) of the points of a light, a table of `light_points`."""
-    least, largest = table.min(axis=0), table.max(axis=0)
-    return np.stack([least[:3], largest[:3], least[3:6], largest[3:6]])
-
-
-class LightGroups(NamedTuple):
-    """Points of a light as successive places look at them; see `kernels.shadow.light_places`."""
-
-    points: F32
-    first: I32
-    colors: F32
-
-
-def light_groups(table: F32, candidates: int, turn: int) -> LightGroups:
-    """Groups of so many points of a table of `light_points`; successive places look at different parts of the light.
-
-    In as many turns as there are groups a place looks at every point once.
-    """
-    n = len(table) // candidates
-    group = (np.arange(n + RUN) * STRIDE ^ turn) & (n - 1)
-    points = table[:, _POINT_COLUMNS].reshape(n, candidates, len(_POINT_COLUMNS))[group]
-    colors = table[:, 6:9]
-    return LightGroups(
-        np.ascontiguousarray(points.transpose(1, 2, 0)),
-        (group * candidates).astype(np.int32),
-        np.ascontiguousarray(colors if (colors != 1.0).any() else colors[:0]),
-    )
+    shining = shining or shining_points(snapshot, seed)
+    look = Look(snapshot, shadows, places, shining, seed, share_rays, out, turn, last, turned)
+    look.light(np.arange(len(places.place), dtype=np.int32) if runs is None else runs)
+    look.finish()

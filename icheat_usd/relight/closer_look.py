@@ -6,7 +6,8 @@ import numpy as np
 
 from icheat_usd.kernels.closer_look import noise_of_runs, take_closer_looks
 from icheat_usd.kernels.shadow_lanes import RUN
-from icheat_usd.lighting.quick import LastLook, Places, Shadows, direct_at
+from icheat_usd.kernels.workers import take_back
+from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, direct_at
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot
 
@@ -39,7 +40,7 @@ class CloserLook:
         alone: SceneSnapshot,
         shadows: Shadows,
         seed: int,
-        shining: tuple[F32, bool],
+        shining: Shining,
         direct: F32,
         turned: I32 | None = None,
     ) -> None:
@@ -61,8 +62,10 @@ class CloserLook:
         self._last.forget(np.flatnonzero(self._looked_at > before))
         if not len(runs):
             return
+        take_back()
         direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs, turned)
         self._take(runs, direct)
+        take_back()
         worst = self._worst_runs(direct, light, runs)
         if len(worst):
             places = (worst[:, None] * RUN + np.arange(RUN)).ravel()
@@ -74,10 +77,11 @@ class CloserLook:
             self._found[places] = total / np.float32(TURNS)
             self._take(worst, direct)
 
-    def _noise(self, direct: F32) -> tuple[F64, float]:
-        """Squared noise of each run, and the light of all."""
-        found = np.empty((2, len(self._begin)))
-        noise_of_runs(direct, self._gather.area, self._begin, self._end, found)
+    def _noise(self, direct: F32, runs: I32 | slice = slice(None)) -> tuple[F64, float]:
+        """Squared noise of each of some runs, and their light."""
+        begin, end = self._begin[runs], self._end[runs]
+        found = np.empty((2, len(begin)))
+        noise_of_runs(direct, self._gather.area, begin, end, found)
         return found[0], float(found[1].sum())
 
     def _noisy_runs(self, direct: F32) -> tuple[float, I32]:
@@ -96,7 +100,7 @@ class CloserLook:
 
     def _worst_runs(self, direct: F32, light: float, runs: I32) -> I32:
         """Those of some runs that are still noisy, ascending; none if that does not matter."""
-        noise = self._noise(direct)[0][runs]
+        noise = self._noise(direct, runs)[0]
         worst = np.sort(runs[_largest(noise, WORST_RUNS)])
         return worst if noise.sum() > (LEFT_NOISE * light) ** 2 else worst[:0]
 

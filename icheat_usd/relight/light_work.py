@@ -10,6 +10,7 @@ import numpy as np
 
 from icheat_usd.kernels.random import hash_combine
 from icheat_usd.kernels.rows import mean_over_segments
+from icheat_usd.kernels.workers import beside
 from icheat_usd.lighting import (
     build_light_sampler,
     irradiance,
@@ -20,8 +21,17 @@ from icheat_usd.lighting import (
 from icheat_usd.lighting.controls import darken, hidden_instances, receives, tracer_for
 from icheat_usd.lighting.domes import BinnedSky, SeenSky, see_sky, white_sky
 from icheat_usd.lighting.guide import LITTLE, Steps
-from icheat_usd.lighting.points import has_points, light_points
-from icheat_usd.lighting.quick import LastLook, Places, Shadows, build_shadows, direct_at, prepare_places
+from icheat_usd.lighting.points import has_points
+from icheat_usd.lighting.quick import (
+    LastLook,
+    Look,
+    Places,
+    Shadows,
+    build_shadows,
+    direct_at,
+    prepare_places,
+    shining_points,
+)
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import CloserLook
@@ -295,7 +305,7 @@ class MovingLight:
         self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
     ) -> None:
         self._around, self._alone, self._seed, self._rounds = around, alone, seed, light_samples
-        self._shining = light_points(alone, seed)
+        self._shining = shining_points(alone, seed)
         self._step = self._n_found = self._n_near = 0
         self._near: I64 | None = None  # cells next to the light, from the last round on
         self._exposed: I64 | None = None  # view samples next to it or with narrow lobes, once the bounces are done
@@ -318,12 +328,17 @@ class MovingLight:
         shadows = around.shadows_of(self._alone)
         before = last.cells.known.copy()
         direct_at(self._alone, shadows, around.cells, self._seed, False, direct, 0, last.cells, self._shining)
-        turned = last.cells.turned_points(before, len(self._shining[0]))
-        last.patches.improve(self._alone, shadows, self._seed, self._shining, direct, turned)
-        around.bounce(direct, radiance, self.direct, last.next_part())
+        turned = last.cells.turned_points(before, len(self._shining.table))
+        tiles, closer = around.tiles, last.patches
+        look = Look(self._alone, shadows, tiles, self._shining, self._seed, True, view_direct, 0, last.view, turned)
+
+        def bounce() -> None:
+            closer.improve(self._alone, shadows, self._seed, self._shining, direct, turned)
+            around.bounce(direct, radiance, self.direct, last.next_part())
+
+        beside(bounce, look.pieces())
+        look.finish()
         self.direct = direct
-        view = around.tiles, self._seed, True, view_direct, 0, last.view, self._shining
-        direct_at(self._alone, shadows, *view, turned=turned)
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """Another round at the cells or at the view; False after the last."""
@@ -347,7 +362,7 @@ class MovingLight:
         shadows = around.shadows_of(self._alone)
         # Points of its own for every round: what lies next to a light sees how far they are apart.
         seed = int(hash_combine(self._seed, turn)) & 0x7FFFFFFF
-        direct_at(self._alone, shadows, places, seed, False, found, turn, shining=light_points(self._alone, seed))
+        direct_at(self._alone, shadows, places, seed, False, found, turn, shining=shining_points(self._alone, seed))
         into += found if at_view else around.cell_means(found)
         share = np.float32(1.0 / (turn + 1))
         if at_view:
@@ -366,7 +381,7 @@ class MovingLight:
         """Light some of the cells next to the light in the general way; False once all are."""
         gather, n = self._around.gather, self._rounds
         if self._near is None:
-            self._near = np.flatnonzero(_is_near(gather.points.position, *self._shining))
+            self._near = np.flatnonzero(_is_near(gather.points.position, self._shining.table, self._shining.distant))
             self._sampler = build_light_sampler(self._alone)
         first = self._n_near
         if first >= len(self._near):
@@ -385,7 +400,7 @@ class MovingLight:
         around, first = self._around, self._n_found
         view = around.view
         if self._exposed is None:
-            near = np.flatnonzero(_is_near(view.points.position, *self._shining))
+            near = np.flatnonzero(_is_near(view.points.position, self._shining.table, self._shining.distant))
             self._exposed = np.union1d(near, around.smooth)
         rows = self._exposed[first : first + max(1, _RAYS_PER_STEP // self._rounds)]
         if len(rows):

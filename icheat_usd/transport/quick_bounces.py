@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels import quick_bounces as kernels
+from icheat_usd.kernels.workers import take_back
 from icheat_usd.samples import ClusterTree
 from icheat_usd.scene import F32, I64
 from icheat_usd.transport.bounces import Bounces
@@ -25,7 +26,7 @@ _WHITE, _WHITE_COUNTS = 0.9, 8  # cells of a larger albedo stand for so many
 _LASTING = 12
 
 # Another step if the light was out of balance by more than this share before the last; each takes away most of it.
-_UNBALANCED = 0.02
+_UNBALANCED = 0.04
 _FAR = 0.1  # of all cells, if it was by more than this
 
 
@@ -108,6 +109,7 @@ class QuickBounces:
         leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 2), np.float32)
         arriving = np.empty((self.n_clusters, 3), np.float32)
         rows = self.indptr, self.entries, self.column_bits
+        take_back()
         kernels.find_missing(
             self.begin,
             self.share,
@@ -129,6 +131,7 @@ class QuickBounces:
     def _add(self, leaves: F32, here: F32 | None, part: tuple[int, int], out: F32) -> None:
         """Add the later bounces of light that leaves clusters; and what is missing, which arrives as `here` says."""
         later = np.empty((self.n_clusters, 3), np.float32)
+        take_back()
         kernels.reach_clusters(self.blocks, leaves, later)
         light, missing = self.scratch
         here, missing = (later, missing[:0]) if here is None else (here, missing)

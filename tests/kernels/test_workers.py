@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 
@@ -12,7 +13,7 @@ import pytest
 
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
-from icheat_usd.kernels.workers import overlapping
+from icheat_usd.kernels.workers import beside, overlapping, take_back
 
 
 @numba.njit(parallel=True, nogil=True)
@@ -122,3 +123,65 @@ def test_who_asked_is_told_of_kernels_that_pieces_compile(several_workers: None)
     with told_of_compiling(lambda n, name: heard.append(name)):
         list(overlapping([partial(compiled, float(i)) for i in range(8)]))
     assert heard == ["tripled"]
+
+
+def test_pieces_beside_some_work_have_the_bits_of_those_after_it() -> None:
+    found: list[list[float]] = [[] for _ in range(40)]
+
+    def make(i: int) -> None:
+        found[i] = piece(i)
+
+    assert beside(lambda: piece(100), [partial(make, i) for i in range(40)]) == piece(100)
+    assert found == [piece(i) for i in range(40)]
+
+
+def test_another_thread_does_pieces_while_the_work_goes_on(several_workers: None) -> None:
+    begun, n = threading.Event(), numba.get_num_threads()
+    shares: list[int] = []
+
+    def aside() -> None:
+        shares.append(numba.get_num_threads())
+        begun.set()
+
+    def work() -> int:
+        assert begun.wait(10), "no piece was begun while the work went on"
+        return numba.get_num_threads()
+
+    assert beside(work, [aside]) + shares[0] == n
+    assert numba.get_num_threads() == n
+
+
+def test_work_has_all_workers_again_once_the_pieces_are_done(several_workers: None) -> None:
+    def work() -> int:
+        deadline = time.monotonic() + 10
+        while numba.get_num_threads() < n and time.monotonic() < deadline:
+            take_back()
+        return numba.get_num_threads()
+
+    n = numba.get_num_threads()
+    assert beside(work, [partial(piece, 1)]) == n
+    take_back()  # which means nothing elsewhere
+    assert numba.get_num_threads() == n
+
+
+def test_with_one_worker_pieces_follow_the_work() -> None:
+    done: list[str] = []
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        beside(lambda: done.append("work"), [partial(done.append, "first"), partial(done.append, "second")])
+    finally:
+        numba.set_num_threads(before)
+    assert done == ["work", "first", "second"]
+
+
+@pytest.mark.parametrize("fails", ["work", "piece"])
+def test_whoever_fails_beside_the_other_is_heard_of(fails: str) -> None:
+    def maybe(name: str) -> None:
+        if name == fails:
+            raise IndexError(name)
+
+    before = numba.get_num_threads()
+    with pytest.raises(IndexError, match=fails):
+        beside(partial(maybe, "work"), [partial(maybe, "piece")])
+    assert numba.get_num_threads() == before

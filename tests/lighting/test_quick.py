@@ -13,7 +13,7 @@ from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direc
 from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
 from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
 from icheat_usd.lighting.points import light_points
-from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, light_bounds, prepare_places
+from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, prepare_places, shining_points
 from icheat_usd.lighting.sampler import prepare_light_sampler
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
@@ -288,6 +288,6 @@ def test_runs_behind_a_light_are_dark_without_a_look(name: str) -> None:
         direct_at(snapshot, shadows, some, 5, False, out)
     np.testing.assert_array_equal(found.view(np.uint32), looked_at.view(np.uint32))
     assert 0.1 < (found.sum(axis=1) > 0).mean() < 0.9
-    light = light_points(snapshot, 5)
-    turned_away = [is_turned_away(some, light_bounds(light[0]), light[1]) for some in places.bounds]
+    light = shining_points(snapshot, 5)
+    turned_away = [is_turned_away(some, light.bounds, light.distant) for some in places.bounds]
     assert 0.1 < np.mean(turned_away) < 0.9
