@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.benchmarking import rival_summary
+from tests.scenes import closed_box
+from tools.benchmarking import references, rival_summary
 from tools.benchmarking.goals import Goal, at_least, at_most
-from tools.benchmarking.mitsuba_layers import MitsubaLayers
+from tools.benchmarking.mitsuba_layers import Layers, MitsubaLayers
 from tools.benchmarking.references import Reference
 from tools.benchmarking.render_sequence import flicker, flicker_of_median
 from tools.benchmarking.rival_errors import squared_errors, trimmed_rel_mse
@@ -118,6 +119,29 @@ def test_goals_say_what_was_met_and_what_was_missed() -> None:
     assert at_most("time", goals) == "Goal, time at most 1.05 / 1.1; met: 1 edit 1.02; missed: 8 edits 1.4."
     assert at_least("speed", goals) == "Goal, speed at least 1.05 / 1.1; met: 8 edits 1.4; missed: 1 edit 1.02."
     assert at_most("time", []).endswith("not measured.")
+
+
+@pytest.mark.parametrize("n_pixels", [320 * 240, 640 * 480, 1920 * 1080])
+def test_halves_of_a_reference_and_what_is_measured_have_random_numbers_of_their_own(n_pixels: int) -> None:
+    # as Mitsuba's scalar variant makes streams of seeds
+    streams = {(first + n) * n_pixels % 2**32 for first in (0, *references._FIRST_SEED) for n in range(4096)}
+    assert len(streams) == 3 * 4096
+
+
+def test_halves_that_are_one_are_no_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Alike:
+        most_samples = 1
+
+        def __init__(self, *_: object) -> None: ...
+
+        def layers(self, samples: int, seed: int) -> Layers:
+            return Layers(np.ones((2, 2, 3)), np.ones((2, 2, 3)), 0.0)
+
+    monkeypatch.setattr(references, "MitsubaLayers", Alike)
+    monkeypatch.setattr(references, "scene_key", lambda *_: "key")
+    with pytest.raises(ValueError, match="the same random numbers"):
+        references.reference("box", closed_box(), 2, tmp_path, minutes=0)
+    assert not any(tmp_path.iterdir())
 
 
 def test_noise_of_a_reference_with_and_without_its_fireflies() -> None:
