@@ -196,7 +196,13 @@ class LightGroups(NamedTuple):
 
 
 class Shining:
-    """Points of a light as `lighting.points.light_points` has them, and what looks at them need."""
+    """Points of a light, and what all looks at them need.
+
+    Parameters
+    ----------
+    table, distant
+        As `lighting.points.light_points` has them.
+    """
 
     def __init__(self, table: F32, distant: bool) -> None:
         self.table, self.distant = table, distant
