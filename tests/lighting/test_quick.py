@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.shadow import is_turned_away
+from icheat_usd.kernels.shadow import PART, is_turned_away
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
 from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
@@ -136,7 +136,7 @@ def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
     last, images = LastLook(places), LightImages(first.textures)
     alone = one_light(first, 0)
     old = []
-    for step in range(12):
+    for step in range(8 + PART):
         moved = translation(0.02 * min(step, 8), 0, 0) @ np.vstack([LIGHTS["rect"].to_world, [0, 0, 0, 1]])
         alone = changed_light(images, alone, to_world=moved[:3])
         direct_at(alone, shadows, places, 5, False, found, last=last)
