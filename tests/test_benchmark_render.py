@@ -143,6 +143,13 @@ def test_halves_that_are_one_are_no_reference(tmp_path: Path, monkeypatch: pytes
         references.reference("box", closed_box(), 2, tmp_path, minutes=0)
     assert not any(tmp_path.iterdir())
 
+    # Files of before that was refused are no reference either.
+    shot = closed_box()
+    kept = tmp_path / f"box-{shot.camera.width}x{shot.camera.height}-key.npz"
+    np.savez(kept, sums=np.ones((2, 2, 2, 2, 3)), samples=1, seconds=0.0, passes=1)
+    with pytest.raises(ValueError, match=f"{kept.name}, which is to be deleted.*the same random numbers"):
+        references.reference("box", shot, 2, tmp_path, minutes=0)
+
 
 def test_noise_of_a_reference_with_and_without_its_fireflies() -> None:
     rng = np.random.default_rng(3)

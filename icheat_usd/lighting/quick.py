@@ -29,8 +29,8 @@ _CANDIDATES = 4  # points of the light that a place looks at
 _FEW_CANDIDATES = 2  # where places share rays
 _PIECE = 256  # runs of a look that a thread takes at a time
 _NO_POINTS = np.zeros(0, np.int32)
-# Share of the places that see a point now or did before from which it counts as turned, and how many places there must
-# be.
+# A point has turned if more than this share of the places that see it, now or before, met something else; and from how
+# many such places on that is known.
 _TURNED_SHARE, _LEAST_LOOKS = 0.5, 4
 
 
@@ -241,10 +241,8 @@ class Look:
 
     Parameters
     ----------
-    seed, share_rays, out, turn, last, turned
+    snapshot, shadows, places, shining, seed, share_rays, out, turn, last, turned
         As `direct_at` has them.
-    shining : Shining
-        Points of the light.
     """
 
     def __init__(

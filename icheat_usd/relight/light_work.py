@@ -27,6 +27,7 @@ from icheat_usd.lighting.quick import (
     Look,
     Places,
     Shadows,
+    Shining,
     build_shadows,
     direct_at,
     prepare_places,
@@ -238,11 +239,11 @@ def _tile_order(view: ViewSamples) -> I64:
     return np.argsort(key, kind="stable")
 
 
-def _is_near(position: F32, table: F32, distant: bool) -> Bool:
+def _is_near(position: F32, shining: Shining) -> Bool:
     """Which places (n, 3) are near a light of these points."""
-    if distant:
+    if shining.distant:
         return np.zeros(len(position), np.bool_)
-    low, high = table[:, :3].min(axis=0), table[:, :3].max(axis=0)
+    low, high = shining.bounds[:2]
     gap = np.maximum(np.maximum(low - position, position - high), 0)
     near: Bool = np.linalg.norm(gap, axis=1) < _NEAR * np.linalg.norm(high - low)
     return near
@@ -381,7 +382,7 @@ class MovingLight:
         """Light some of the cells next to the light in the general way; False once all are."""
         gather, n = self._around.gather, self._rounds
         if self._near is None:
-            self._near = np.flatnonzero(_is_near(gather.points.position, self._shining.table, self._shining.distant))
+            self._near = np.flatnonzero(_is_near(gather.points.position, self._shining))
             self._sampler = build_light_sampler(self._alone)
         first = self._n_near
         if first >= len(self._near):
@@ -400,7 +401,7 @@ class MovingLight:
         around, first = self._around, self._n_found
         view = around.view
         if self._exposed is None:
-            near = np.flatnonzero(_is_near(view.points.position, self._shining.table, self._shining.distant))
+            near = np.flatnonzero(_is_near(view.points.position, self._shining))
             self._exposed = np.union1d(near, around.smooth)
         rows = self._exposed[first : first + max(1, _RAYS_PER_STEP // self._rounds)]
         if len(rows):

@@ -78,10 +78,12 @@ def reference(
     Raises
     ------
     ValueError
-        Mitsuba's render is no image.
+        Mitsuba's render is no image, or both halves are the same one.
     """
     path = folder / f"{name}-{snapshot.camera.width}x{snapshot.camera.height}-{scene_key(snapshot, depth)}.npz"
     sums, samples, spent, n_passes = _read(path)
+    if sums is not None:
+        _refuse_one_half(f"{path}, which is to be deleted", sums)
     deadline = time.perf_counter() + 60 * minutes
     if samples and (minutes <= 0 or samples >= most_samples):
         return _reference(sums, samples, spent)
@@ -92,8 +94,7 @@ def reference(
         more = np.stack([[half.indirect, half.whole] for half in both]) * renderer.most_samples
         if not np.isfinite(more).all():
             raise ValueError(f"{name}: Mitsuba's render holds values that are no numbers, so it is no reference")
-        if more.any() and np.array_equal(more[0], more[1]):
-            raise ValueError(f"{name}: Mitsuba rendered both halves with the same random numbers, so they are one")
+        _refuse_one_half(name, more)
         sums = more if sums is None else sums + more
         samples, n_passes = samples + renderer.most_samples, n_passes + 1
         if time.perf_counter() > saved + 60:
@@ -102,6 +103,11 @@ def reference(
     spent += time.perf_counter() - start
     _write(path, sums, samples, spent, n_passes)
     return _reference(sums, samples, spent)
+
+
+def _refuse_one_half(name: str, sums: F64) -> None:
+    if sums.any() and np.array_equal(sums[0], sums[1]):
+        raise ValueError(f"{name}: Mitsuba rendered both halves with the same random numbers, so they are one")
 
 
 def _reference(sums: Any, samples: int, seconds: float) -> Reference:
