@@ -116,7 +116,7 @@ class Pipeline:
             samples, rays, light_samples, self.n_bounces, seed, method=method, edge_samples=edge_samples, cache=cache
         )
         field = self.field(*edits)
-        needs = method == "cached" or field.uses_incident or field.has_offset
+        needs = settings.uses_cells or field.uses_incident or field.has_offset
         return final_gather(
             self.snapshot,
             self.tracer,

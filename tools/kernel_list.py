@@ -16,7 +16,7 @@ from icheat_usd.kernels._signatures import UnlistedTypeError, dispatchers, encod
 from icheat_usd.resources import resource_path
 from icheat_usd.session.document import Session
 from icheat_usd.session.live import LiveSession
-from icheat_usd.session.quality import DRAFT, LIVE, PREVIEW, RECORDS, Quality
+from icheat_usd.session.quality import DRAFT, LIVE, PREVIEW, QUICK, RECORDS, Quality
 from icheat_usd.session.warming import RARE, Listed
 
 _ROOT = Path(__file__).parents[1]
@@ -57,7 +57,9 @@ def _relight() -> None:
 
 def _render() -> None:
     for name in _STAGES:
-        _open(name, replace(PREVIEW, **_LITTLE)).render(GatherSettings(samples_per_pixel=1, light_samples=1))
+        session = _open(name, replace(PREVIEW, **_LITTLE))
+        session.render(GatherSettings(samples_per_pixel=1, light_samples=1))
+        session.render(replace(QUICK, denoise=False))
 
 
 def _open(name: str, quality: Quality) -> Session:

@@ -43,17 +43,23 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--single-part", action="store_true", help="all layers in one part of an .exr")
     parser.add_argument("--force", action="store_true", help="render frames again that are there already")
-    parser.add_argument("--samples", type=positive, metavar="N", help="camera samples a pixel; default 4")
+    parser.add_argument("--samples", type=positive, metavar="N", help="camera samples a pixel; default 4 (quick: 1)")
     parser.add_argument(
-        "--edge-samples", type=at_least_0, metavar="N", help="more of them in pixels with edges; default 12"
+        "--edge-samples", type=at_least_0, metavar="N", help="more of them in pixels with edges; default 12 (quick: 1)"
     )
     parser.add_argument("--filter", metavar="NAME", help="box, triangle, gaussian or blackman-harris; default box")
     parser.add_argument("--filter-width", type=float, metavar="PIXELS", help="of its support; default the usual one")
     parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="a frame in seconds, to look at: denoised from few rays of every camera sample and few gather samples; "
+        "needs pip install 'icheat-usd[denoise]'",
+    )
+    parser.add_argument(
         "--method",
-        choices=("cached", "brute"),
-        help="cached: irradiance is interpolated where it is smooth; brute: every camera sample gathers for itself, "
-        "slow and unbiased",
+        choices=("cached", "gathered", "brute"),
+        help="cached: irradiance is interpolated where it is smooth; gathered: every camera sample sends rays of its "
+        "own to the gather samples, noisy and for --denoise; brute: it follows paths, slow and unbiased",
     )
     parser.add_argument(
         "--noise",
@@ -68,7 +74,9 @@ def setup_parser(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--denoise", action="store_true", help="with Open Image Denoise: pip install 'icheat-usd[denoise]'"
     )
-    parser.add_argument("--rays", type=positive, metavar="N", help="gather rays where no light is cached; default 64")
+    parser.add_argument(
+        "--rays", type=positive, metavar="N", help="gather rays where no light is cached; default 64 (quick: 8)"
+    )
     parser.add_argument(
         "--bounces", type=positive, metavar="N", help="diffuse reflections before the last one; default 16"
     )
@@ -84,13 +92,16 @@ def at_least_0(text: str) -> int:
 def command(options: argparse.Namespace) -> int:
     from icheat_usd.cli.sequence import render_frames
     from icheat_usd.errors import SettingsError
-    from icheat_usd.session import GatherSettings
+    from icheat_usd.session.quality import FINAL, PREVIEW, QUICK, QUICK_CELLS
 
-    if options.method == "brute":
-        of_cached = {"--noise": options.noise, "--edge-samples": options.edge_samples}
-        wrong = [name for name, value in of_cached.items() if value is not None]
-        if wrong:
-            raise SettingsError(f"the brute method has no use for {', '.join(wrong)}; leave that out, or the method")
+    start, quality = (QUICK, QUICK_CELLS) if options.quick else (FINAL, PREVIEW)
+    method = options.method or start.method
+    unused = {"--noise": options.noise if method != "cached" else None}
+    if method == "brute":
+        unused["--edge-samples"] = options.edge_samples
+    wrong = [name for name, value in unused.items() if value is not None]
+    if wrong:
+        raise SettingsError(f"the {method} method has no use for {', '.join(wrong)}; leave that out, or the method")
     given = {
         "samples_per_pixel": options.samples,
         "gather_rays": options.rays,
@@ -103,7 +114,7 @@ def command(options: argparse.Namespace) -> int:
         "denoise": options.denoise or None,
     }
     chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    settings = replace(GatherSettings(seed=options.seed), **chosen)
+    settings = replace(start, seed=options.seed, **chosen)
     if options.noise is not None:
         settings = replace(settings, cache=replace(settings.cache, noise=options.noise))
-    return render_frames(options, settings)
+    return render_frames(options, settings, quality)

@@ -31,8 +31,13 @@ class _View:
     outputs: tuple[Output, ...]
 
 
-def render_frames(options: argparse.Namespace, settings: GatherSettings) -> int:
+def render_frames(options: argparse.Namespace, settings: GatherSettings, quality: Quality) -> int:
     """Write every output of every frame.
+
+    Parameters
+    ----------
+    quality : Quality
+        Of the gather samples; their seed and bounces are those of the settings.
 
     Raises
     ------
@@ -58,7 +63,7 @@ def render_frames(options: argparse.Namespace, settings: GatherSettings) -> int:
             progress.prefix = f"{name}: " if name and len(frames) > 1 else ""
             for view in views[frame]:
                 try:
-                    images.append(_render(options, settings, stage, frame, view, progress, found))
+                    images.append(_render(options, settings, quality, stage, frame, view, progress, found))
                 except IcheatError as error:
                     if not name or len(frames) == 1:
                         raise
@@ -69,6 +74,7 @@ def render_frames(options: argparse.Namespace, settings: GatherSettings) -> int:
 def _render(
     options: argparse.Namespace,
     settings: GatherSettings,
+    quality: Quality,
     stage: Any,
     frame: float | None,
     view: _View,
@@ -84,7 +90,7 @@ def _render(
         stack=options.stack,
         width=options.width,
         height=options.height,
-        quality=Quality(seed=options.seed, n_bounces=settings.n_bounces),
+        quality=replace(quality, seed=options.seed, n_bounces=settings.n_bounces),
         progress=progress,
         product=view.product,
     )

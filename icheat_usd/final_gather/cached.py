@@ -1,4 +1,7 @@
-"""Indirect light of camera samples from an irradiance cache: diffuse interpolated, glossy gathered, edits mixed in."""
+"""Indirect light of camera samples from an irradiance cache: diffuse interpolated, glossy gathered, edits mixed in.
+
+Samples that no record reaches gather for themselves: with a cache that has no records, all of them.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +43,8 @@ class CachedGather:
         With rays, if the stack has edits.
     glossy_rays : int
         Per point with a specular lobe.
-    samples_per_pixel : int
-        Of pixels with camera samples that no record reaches; these share the rays that a record has.
+    own_strata : (int, int)
+        Rings and sectors of the rays of camera samples that no record reaches.
     is_kept : bool
         Whether to keep `samples` and `receivers`, what was found at every call of `light`, for other stacks.
     """
@@ -51,13 +54,12 @@ class CachedGather:
         gatherer: Gatherer,
         cache: IrradianceCache,
         glossy_rays: int,
-        samples_per_pixel: int,
+        own_strata: tuple[int, int],
         *,
         is_kept: bool = False,
     ) -> None:
         self._gatherer, self.cache, self._glossy_rays = gatherer, cache, glossy_rays
-        self._is_kept = is_kept
-        self._own_rings = max(4, 4 * round(cache.settings.n_theta / (4 * np.sqrt(samples_per_pixel))))
+        self._is_kept, self._own_strata = is_kept, own_strata
         self.samples: list[Sampled] = []
         self.receivers: list[Touched] = []
         self._parts = CachedParts(gatherer.parts, cache)
@@ -90,8 +92,8 @@ class CachedGather:
         # What the coarser look at the scene has missed, less than a pixel wide, is gathered where it is.
         alone, own_rays = np.flatnonzero(found.number == 0), None
         if len(alone):
-            own_rays = self.cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone], self._own_rings)
-            irradiance[alone] = np.pi * own_rays.radiance(self.cache.cells).mean(axis=1)
+            own_rays = self.cache.tracer.trace(take_points(points, alone), _ALONE + stream[alone], self._own_strata)
+            irradiance[alone] = np.pi * own_rays.mean_radiance(self.cache.cells)
         base = (points.albedo * (irradiance * _INVERSE_PI)).astype(np.float32, copy=False)
         shiny = specular_lobe(self._gatherer, points, to_eye, draws, self._glossy_rays, seed)
         if shiny is not None:
@@ -236,7 +238,7 @@ class CachedParts:
         points, alone = sampled.points, sampled.alone
         light = self._cache.interpolate(sampled.found, points.position, points.shading_normal, self._values)
         if sampled.own_rays is not None:
-            light[alone] = np.pi * sampled.own_rays.parts[0].rays.radiance(self._cells).mean(axis=1)
+            light[alone] = np.pi * sampled.own_rays.parts[0].rays.mean_radiance(self._cells)
         parts = light.reshape(len(light), len(self._parts), 3).transpose(1, 0, 2)
         wanted, positive = np.maximum(parts.sum(axis=0), 0), np.maximum(parts, 0)
         there = positive.sum(axis=0)

@@ -12,9 +12,10 @@ from icheat_usd.final_gather.settings import GatherSettings
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.samples import ViewSamples, view_samples
 from icheat_usd.samples.adaptive import edge_pixels, join_looks, look_over
+from icheat_usd.samples.develop import average
 from icheat_usd.samples.pixel_filter import PixelFilter
 from icheat_usd.samples.view import SkyPaths
-from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.scene import F32, F64, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 
 #: Camera samples that are kept from the first pass for the second, of all bands; 200 bytes each.
@@ -81,7 +82,7 @@ class CameraPass:
             measured = self._measure(view)
             if self._is_kept:
                 self._kept[number] = view, measured
-            if self._n_edge:
+            if self._n_edge or self._settings.feature_samples:
                 looks.append(look_over(view, self._snapshot.camera, pixels))
             yield Band(pixels, view, _NO_EDGES, measured)
         if looks:
@@ -101,12 +102,27 @@ class CameraPass:
                 measured = self._measure(view)
             begin, end = np.searchsorted(self._edges, pixels)
             edges = self._edges[begin:end]
-            if len(edges):
+            if len(edges) and self._n_edge:
                 more = self._trace(edges, self._n_edge, self._first_edge)
                 both = np.concatenate([measured, self._measure(more)])
                 view, order = _joined(view, more, edges)
                 measured = both[order]
             yield Band(pixels, view, edges, measured)
+
+    def features(self, band: Band) -> tuple[F64, F64]:
+        """Mean albedo and shading normal of the pixels of a band, (n_pixels, 3) each; with edges, of more samples."""
+        view, n = band.view, self._settings.feature_samples
+        albedo = average(view, view.points.albedo, band.pixels)
+        normal = average(view, view.points.shading_normal, band.pixels)
+        if n and len(band.edges):
+            more = self._trace(band.edges, n, self._first_edge + self._n_edge)
+            # Of samples that see a surface.
+            seen, seen_more = (np.bincount(one.pixel, minlength=view.width * view.height) for one in (view, more))
+            share = (seen_more / np.maximum(seen + seen_more, 1))[band.edges, None]
+            rows = band.edges - band.pixels[0]
+            albedo[rows] += share * (average(more, more.points.albedo, band.edges) - albedo[rows])
+            normal[rows] += share * (average(more, more.points.shading_normal, band.edges) - normal[rows])
+        return albedo, normal
 
     def _trace(self, pixels: tuple[int, int] | I64, n: int, first: int) -> ViewSamples:
         return view_samples(

@@ -15,9 +15,9 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import F32, F64
 
 
-def with_denoising(extras: Extras) -> Extras:
-    """Extras and all that `denoised` needs."""
-    return replace(extras, contributions=True, objects=True, edits=True)
+def with_denoising(extras: Extras, edits: Sequence[str]) -> Extras:
+    """Extras and all that `denoised` needs for a stack with these active edits."""
+    return replace(extras, contributions=True, objects=True, edits=True) if edits else extras
 
 
 def denoised(result: FinalGather, edits: Sequence[str], *, progress: Progress = silent) -> FinalGather:
@@ -41,7 +41,7 @@ def denoised(result: FinalGather, edits: Sequence[str], *, progress: Progress = 
     ValueError
         The result lacks coverage of objects or edits.
     """
-    if not {"object", "edit"} <= result.coverage.keys():
+    if edits and not {"object", "edit"} <= result.coverage.keys():
         raise ValueError("a final gather can only be denoised if it was rendered with the extras of with_denoising()")
     progress("denoise", 0.0)
     albedo, normal = (np.ascontiguousarray(layer, np.float32) for layer in (result.albedo, result.normal))

@@ -3,7 +3,8 @@
 All camera samples of a pixel draw from one low-discrepancy sequence for each
 light, so that the pixel's rays are stratified over the light together; pixels
 with more camera samples take fewer rays at each. Penumbrae are found by the
-first rays of a pixel and of those around it, and all rays count.
+first rays of a pixel and of those around it, and all rays count. A denoiser wants noise that is alike everywhere,
+and gets as many rays of every pixel.
 """
 
 from __future__ import annotations
@@ -127,7 +128,9 @@ class DirectLight:
 
     def _whole(self, first: _First, above: F32 | None, below: F32 | None) -> F32:
         view, light = first.band.view, first.light
-        doubtful = _disagreeing(first.extremes, above, below)
+        # Nobody is asked where all pixels have had their rays.
+        has_second = any(whole > n for part in first.parts for n, whole in zip(part.first, part.whole, strict=True))
+        doubtful = _disagreeing(first.extremes, above, below) if has_second else np.empty((0, 0), np.bool_)
         place = view.pixel - first.band.pixels[0]
         for part in first.parts:
             for one in self._lights:
@@ -161,13 +164,15 @@ class DirectLight:
         has_edge = np.zeros(len(band.view.background), np.bool_)
         has_edge[band.edges] = True
         is_edge = has_edge[band.view.pixel]
-        most = [max(usual, _IN_DOUBT * s.light_samples) for usual in self._usual]
+        most, begun = [max(usual, _IN_DOUBT * s.light_samples) for usual in self._usual], _FIRST
+        if s.denoise:
+            most, begun = self._usual, 1.0
         parts = []
         for mine, n in ((~is_edge, s.samples_per_pixel), (is_edge, s.samples_per_pixel + s.edge_samples)):
             rows = np.flatnonzero(mine)
             if len(rows):
                 share = s.samples_per_pixel / n
-                first, whole = self._counts(self._usual, _FIRST * share), self._counts(most, share)
+                first, whole = self._counts(self._usual, begun * share), self._counts(most, share)
                 n_specular = specular_count([math.ceil(share * usual) for usual in self._usual])
                 parts.append(_Part(rows, first, whole, n_specular))
         return parts

@@ -45,7 +45,7 @@ from icheat_usd.final_gather.replay import KeptBand, Replay
 from icheat_usd.final_gather.settings import GatherSettings
 from icheat_usd.image.cryptomatte import Coverage, weighted_sum
 from icheat_usd.kernels.random import hash_combine
-from icheat_usd.lighting import build_light_sampler
+from icheat_usd.lighting import LightSampler, build_light_sampler
 from icheat_usd.materials import concatenate_points, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, view_samples
@@ -57,7 +57,7 @@ from icheat_usd.transport import sum_groups
 #: Gather rays in flight; bounds memory and keeps a chunk's arrays near the caches.
 RAYS_AT_ONCE = 1 << 19
 
-#: Camera samples that are shaded together, where light is cached.
+#: Camera samples that are shaded together, where earlier bounces are those of the gather samples.
 SAMPLES_AT_ONCE = 1 << 17
 
 #: What the indirect light of a band is found by, from random counters and sequences of its samples and a seed.
@@ -114,6 +114,7 @@ def final_gather(
     settings: GatherSettings,
     gather: GatherSamples | None = None,
     gather_radiance: F32 | None = None,
+    sampler: LightSampler | None = None,
     extras: Extras = NO_EXTRAS,
     is_kept: bool = False,
     progress: Progress = silent,
@@ -133,6 +134,8 @@ def final_gather(
         operations that depend on the colour of the light, whose ratio must not
         be formed from single noisy rays, by curves, and by offsets, which are
         integrated over area.
+    sampler : LightSampler, optional
+        One that knows where lights can be seen; by default that is learnt here, around what the camera sees.
     extras : Extras
         What to compute beside the usual layers.
     is_kept : bool
@@ -144,15 +147,13 @@ def final_gather(
     EditError
         The stack needs the gather-sample solution and it was not given.
     """
-    is_cached = settings.method == "cached"
-    if (is_cached or field.uses_incident or field.has_offset) and (gather is None or gather_radiance is None):
+    if (settings.uses_cells or field.uses_incident or field.has_offset) and (gather is None or gather_radiance is None):
         raise EditError(
-            "the cached method and this edit stack need the gather-sample solution: pass gather and gather_radiance"
+            f"the {settings.method} method and this edit stack need the gather-sample solution: pass gather and "
+            "gather_radiance"
         )
     progress("gather", 0.0)
-    # Only domes are learnt about.
-    pilot = _pilot_points(snapshot, tracer, settings.seed) if (snapshot.lights.kind == LightKind.DOME).any() else None
-    sampler = build_light_sampler(snapshot, tracer, pilot, settings.seed)
+    sampler = sampler or _sampler_of_view(snapshot, tracer, settings.seed)
     gatherer = Gatherer(
         snapshot,
         tracer,
@@ -162,33 +163,34 @@ def final_gather(
         field,
         _solution(field, gather, gather_radiance),
         tuple(build_tracer(snapshot, tracer.engine, hidden=field.edits[edit].occluders) for edit in field.throughs),
-        follows_paths=not is_cached,
+        follows_paths=not settings.uses_cells,
     )
     if extras.contributions:
         gatherer = with_prefixes(gatherer)
     if extras.indirect:
         gatherer = with_parts(gatherer, extras.light_groups, gather_radiance)
-    band = SAMPLES_AT_ONCE if is_cached else max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
-    n_edge = settings.edge_samples if is_cached else 0
+    band = SAMPLES_AT_ONCE if settings.uses_cells else max(RAYS_AT_ONCE // max(settings.gather_rays, 1), 1)
+    n_edge = settings.edge_samples if settings.uses_cells else 0
     # Errors of images that are parts of one are to cancel.
     seed = settings.seed if settings.first_sample is None else int(hash_combine(settings.seed, settings.first_sample))
     near: dict[str, Any] = {}
-    if is_cached:
+    if settings.is_cached:
         near["measure"] = partial(near_of, snapshot, tracer, seed=seed, most_reach=settings.cache.most_reach)
     camera = CameraPass(snapshot, tracer, settings, n_edge, band, **near)
     find: FindLight = partial(_followed, gatherer)
     bands: list[_Band] = []
     kept: list[KeptBand] = []
     replay, records = None, None
-    if is_cached and gather is not None and gather_radiance is not None:
-        cached, records = _cached(gatherer, gather, camera, settings, seed, is_kept, progress)
+    if settings.uses_cells and gather is not None and gather_radiance is not None:
+        cached, records = _from_cells(gatherer, gather, camera, settings, seed, is_kept, progress)
         find = partial(_interpolated, gatherer, cached)
         replay = Replay(gatherer, cached, kept, gather_radiance) if is_kept else None
     direct = DirectLight(snapshot, tracer, sampler, settings)
     for number, (part, per_light) in enumerate(direct.bands(camera.all())):
         progress("gather", number / len(camera.bands))
         own_seed = int(hash_combine(seed, part.pixels[0]))
-        bands.append(_band(gatherer, find, part, per_light, draws_of(part.view, settings), own_seed, extras))
+        features = camera.features(part)
+        bands.append(_band(gatherer, find, part, per_light, features, draws_of(part.view, settings), own_seed, extras))
         if replay is not None:
             kept.append(KeptBand(part.pixels, part.view))
     progress("gather", 1.0)
@@ -208,7 +210,7 @@ def final_gather(
     )
 
 
-def _cached(
+def _from_cells(
     gatherer: Gatherer,
     gather: GatherSamples,
     camera: CameraPass,
@@ -216,8 +218,8 @@ def _cached(
     seed: int,
     is_kept: bool,
     progress: Progress,
-) -> tuple[CachedGather, CacheRecords]:
-    """Place all records, by the camera samples that every pixel has."""
+) -> tuple[CachedGather, CacheRecords | None]:
+    """Place all records, if there are to be any, by the camera samples that every pixel has."""
     assert gatherer.solution is not None
     snapshot = gatherer.snapshot
     cells = np.concatenate([gatherer.solution.total, np.zeros((1, 3), np.float32)])
@@ -230,6 +232,19 @@ def _cached(
     keeps_rays = is_kept or bool(gatherer.parts) or not gatherer.field.acts_on_views_alone
     keeps_hits = is_kept or bool(gatherer.parts) or looks_at_hits(gatherer.field)
     cache = IrradianceCache(tracer, cells, settings.cache, keeps_rays, keeps_hits)
+    records = None
+    if settings.is_cached:
+        records = _place_records(cache, snapshot, camera, settings, progress)
+    else:
+        for _ in camera.first():
+            pass  # Edges are found, and nothing is placed.
+    return CachedGather(gatherer, cache, settings.glossy_rays, settings.own_strata, is_kept=is_kept), records
+
+
+def _place_records(
+    cache: IrradianceCache, snapshot: SceneSnapshot, camera: CameraPass, settings: GatherSettings, progress: Progress
+) -> CacheRecords:
+    """Fill a cache, and have more camera samples where its light has edges."""
     found, pixel = [], []
     for band in camera.first():
         found.append(_places(snapshot, band))
@@ -237,12 +252,9 @@ def _cached(
     places, pixels = join_places(found), np.concatenate(pixel)
     width, height = snapshot.camera.width, snapshot.camera.height
     placed = overture(cache, places, pixels, width, progress)
-    records = CacheRecords(placed.pixel, cache.table.reach / placed.extent, placed.spacing)
     if settings.edge_samples:
         camera.sharpen(light_edges(cache, places, pixels, width, width * height))
-    # Pixels that records miss are among those with more samples.
-    n_samples = settings.samples_per_pixel + settings.edge_samples
-    return CachedGather(gatherer, cache, settings.glossy_rays, n_samples, is_kept=is_kept), records
+    return CacheRecords(placed.pixel, cache.table.reach / placed.extent, placed.spacing)
 
 
 def _places(snapshot: SceneSnapshot, band: Band) -> Places:
@@ -257,6 +269,12 @@ def _interpolated(
     gatherer: Gatherer, cached: CachedGather, band: Band, stream: I64, draws: I64, seed: int
 ) -> GatheredLight:
     return cached.light(_places(gatherer.snapshot, band), band.view.to_eye, stream, draws, seed)
+
+
+def _sampler_of_view(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> LightSampler:
+    # Only domes are learnt about.
+    pilot = _pilot_points(snapshot, tracer, seed) if (snapshot.lights.kind == LightKind.DOME).any() else None
+    return build_light_sampler(snapshot, tracer, pilot, seed)
 
 
 def _pilot_points(snapshot: SceneSnapshot, tracer: Tracer, seed: int) -> SurfacePoints:
@@ -288,7 +306,14 @@ def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | N
 
 
 def _band(
-    gatherer: Gatherer, find: FindLight, band: Band, per_light: F32, draws: I64, seed: int, extras: Extras
+    gatherer: Gatherer,
+    find: FindLight,
+    band: Band,
+    per_light: F32,
+    features: tuple[F64, F64],
+    draws: I64,
+    seed: int,
+    extras: Extras,
 ) -> _Band:
     pixels, view = band.pixels, band.view
     light = find(band, view.stream.astype(np.int64) & 0x7FFFFFFF, draws, seed)
@@ -298,8 +323,8 @@ def _band(
         "direct": develop(view, per_light.sum(axis=0), pixels),
         "indirect": develop(view, light.base, pixels),
         "indirect_edited": develop(view, light.edited, pixels),
-        "albedo": average(view, view.points.albedo, pixels),
-        "normal": average(view, view.points.shading_normal, pixels),
+        "albedo": features[0],
+        "normal": features[1],
         "depth": average(view, view.depth[:, None], pixels),
     }
     return _Band(

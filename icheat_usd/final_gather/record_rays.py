@@ -58,6 +58,12 @@ class RecordRays(NamedTuple):
             flat[self.adjusted] *= np.tile(self.throughput, found.shape[-1] // 3)
         return found
 
+    def mean_radiance(self, of_cells: F32) -> F32:
+        """Its mean over the rays of each, (n, C)."""
+        out = np.empty((len(self.cell), of_cells.shape[1]), np.float32)
+        kernels.mean_radiance(self.cell, self.adjusted, self.throughput, of_cells, out)
+        return out
+
     def way(self) -> F32:
         """What the way of rays `adjusted` leaves of light that does not come from cells, (k, 3): 1 of near hits."""
         went = np.isin(self.adjusted, self.detour, assume_unique=True)
@@ -115,10 +121,16 @@ class HemisphereTracer:
         self._n_theta, self._n_phi, self._seed = n_theta, n_phi, seed
         self._route = routed_triangles(snapshot)
 
-    def trace(self, points: SurfacePoints, stream: I64, n_theta: int | None = None) -> RecordRays:
-        """Rays from some points; `stream` (n,) numbers their random sequences. Other rings than usual are `n_theta`."""
-        n_phi = self._n_phi if n_theta is None else 3 * n_theta
-        return self._measure_near(self._trace(points, stream, n_theta or self._n_theta, n_phi))
+    def trace(self, points: SurfacePoints, stream: I64, strata: tuple[int, int] | None = None) -> RecordRays:
+        """Rays from some points; `stream` (n,) numbers their random sequences.
+
+        Parameters
+        ----------
+        strata : (int, int), optional
+            Rings and sectors, 2 or multiples of 4, where these are not the usual ones.
+        """
+        n_theta, n_phi = strata or (self._n_theta, self._n_phi)
+        return self._measure_near(self._trace(points, stream, n_theta, n_phi))
 
     def _measure_near(self, rays: RecordRays) -> RecordRays:
         """Light of near hits, as what it is over the light of their cells: lights have the same shares in both."""

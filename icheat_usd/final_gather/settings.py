@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from icheat_usd.final_gather.irradiance_cache import CacheSettings
 from icheat_usd.samples.pixel_filter import PixelFilter
 
-METHODS = ("cached", "brute")
+METHODS = ("cached", "gathered", "brute")
 BOUNCES = ("cells", "photons")
 
 
@@ -22,13 +23,14 @@ class GatherSettings:
     """
 
     samples_per_pixel: int = 4
-    gather_rays: int = 64  #: per camera sample and lobe that has no cache
+    gather_rays: int = 64  #: per camera sample and lobe that has no cache; the "gathered" method sends 4, 8, 16, 32 ...
     light_samples: int = 8  #: shadow rays per light and camera sample, for direct light
     n_bounces: int = 16  #: diffuse reflections before the last one
     seed: int = 0
     dome_samples: int | None = None  #: `light_samples` of domes; 4 times those of other lights by default
-    #: "cached" interpolates irradiance between records and takes earlier bounces from the gather samples; "brute"
-    #: follows paths from every camera sample: slow, unbiased, what all else is measured against.
+    #: "cached" interpolates irradiance between records and takes earlier bounces from the gather samples; "gathered"
+    #: takes these too, for rays of every camera sample: noisy, and quickest for what is denoised; "brute" follows paths
+    #: from every camera sample: slow, unbiased, what all else is measured against.
     method: str = "cached"
     #: More camera samples in pixels that hold edges of the picture; best a power of two with the others: 8 of them
     #: show edges with less noise than 9.
@@ -46,12 +48,40 @@ class GatherSettings:
     #: gather samples, "photons" by light traced forwards.
     bounces: str = "cells"
     denoise: bool = False  #: by Open Image Denoise, which must be installed
+    #: More camera samples in pixels with edges that only albedo and normal are taken of: what a denoiser takes edges
+    #: from. Of no use to other images.
+    feature_samples: int = 0
 
     def __post_init__(self) -> None:
         if self.bounces not in BOUNCES:
             raise ValueError(f"bounces '{self.bounces}' is none of {', '.join(BOUNCES)}")
         if self.method not in METHODS:
             raise ValueError(f"method '{self.method}' is none of {', '.join(METHODS)}")
-        if self.samples_per_pixel < 1 or self.edge_samples < 0:
-            raise ValueError("samples_per_pixel is at least 1, and edge_samples at least 0")
+        if self.samples_per_pixel < 1 or min(self.edge_samples, self.feature_samples) < 0:
+            raise ValueError("samples_per_pixel is at least 1, and edge_samples and feature_samples at least 0")
         PixelFilter(self.pixel_filter, self.filter_width)
+
+    @property
+    def is_cached(self) -> bool:
+        """Whether light is interpolated between records."""
+        return self.method == "cached"
+
+    @property
+    def uses_cells(self) -> bool:
+        """Whether earlier bounces are those of the gather samples."""
+        return self.method != "brute"
+
+    @property
+    def own_strata(self) -> tuple[int, int]:
+        """Rings and sectors of the rays of a camera sample that no record reaches, 2 or multiples of 4.
+
+        Of the cached method such samples, of pixels with edges, share the rays that a record has.
+        """
+        if self.is_cached:
+            share = math.sqrt(self.samples_per_pixel + self.edge_samples)
+            rings = 4 * max(1, round(self.cache.n_theta / (4 * share)))
+            return rings, 3 * rings
+        if self.gather_rays <= 8:
+            return 2, 2 if self.gather_rays <= 4 else 4
+        rings = 4 * max(1, round(math.sqrt(self.gather_rays / 3) / 4))
+        return rings, 4 * math.ceil(self.gather_rays / (4 * rings))

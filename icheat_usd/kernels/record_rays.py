@@ -21,7 +21,9 @@ from icheat_usd.kernels.samples import basis, unit_circle
 
 _TOUCHING = np.float32(1e-6)  # metres: a ray may end where it starts, in a crease
 _HEMISPHERES = 27  # the bit of a stream from which it counts the hemispheres of one record
-_BLOCK = 4  # strata along each side of a packet: rays of one cone
+_BLOCK = 4  # strata along each side of a packet at most: rays of one cone
+_PACKET = 16
+_CHUNK = 64  # hemispheres that a thread sums
 
 
 @kernel
@@ -58,8 +60,8 @@ def stratum_direction(sx, sy, sz, seed, stream, j, k, n_theta, n_phi):  # type: 
 
 
 @kernel
-def _trace_hemisphere(  # type: ignore[no-untyped-def]
-    r,
+def _trace_some(  # type: ignore[no-untyped-def]
+    first,
     trace,
     cells,
     locator,
@@ -71,8 +73,8 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
     position,
     shading_normal,
     normal,
-    seed,
     stream,
+    seed,
     n_theta,
     n_phi,
     out_cell,
@@ -81,7 +83,7 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
     out_triangle,
     out_uv,
 ):
-    """Row r of `trace_hemispheres`."""
+    """Rows of `trace_hemispheres` from `first` on that share packets: one, or as many as fill one."""
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
     place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
     sample, slot, slot_detour = locator.sample, locator.slot, locator.slot_detour
@@ -89,13 +91,19 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
     valid, rays, words, single, single_words = make_packet()
     ends, at = make_look_up()
     rays_at, valid_at, single_at = rays.ctypes.data, valid.ctypes.data, single.ctypes.data
-    sx, sy, sz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
-    gx, gy, gz = normal[r, 0], normal[r, 1], normal[r, 2]
+    high, wide = min(_BLOCK, n_theta), min(_BLOCK, n_phi)
     for j0 in range(0, n_theta, _BLOCK):
         for k0 in range(0, n_phi, _BLOCK):
-            for e in range(16):
-                x, y, z = stratum_direction(sx, sy, sz, seed, stream, j0 + e // _BLOCK, k0 + e % _BLOCK, n_theta, n_phi)
-                valid[e] = -1 if x * gx + y * gy + z * gz > np.float32(0.0) else 0
+            for e in range(_PACKET):
+                r = first + e // (high * wide)
+                valid[e] = 0
+                if r >= len(stream):
+                    continue
+                j, k = j0 + e // wide % high, k0 + e % wide
+                sx, sy, sz = shading_normal[r, 0], shading_normal[r, 1], shading_normal[r, 2]
+                x, y, z = stratum_direction(sx, sy, sz, seed, stream[r], j, k, n_theta, n_phi)
+                if x * normal[r, 0] + y * normal[r, 1] + z * normal[r, 2] > np.float32(0.0):
+                    valid[e] = -1
                 rays[0, e] = position[r, 0]
                 rays[1, e] = position[r, 1]
                 rays[2, e] = position[r, 2]
@@ -108,8 +116,11 @@ def _trace_hemisphere(  # type: ignore[no-untyped-def]
                 valid, rays, words, mesh_begin, instance_mesh, place, face, square, candidates, sample, slot,
                 slot_detour, locator, points, to_world, to_object, triangle_route, stack, bound, ends, at,
             )  # fmt: skip
-            for e in range(16):
-                column = (j0 + e // _BLOCK) * n_phi + k0 + e % _BLOCK
+            for e in range(_PACKET):
+                r = first + e // (high * wide)
+                if r >= len(stream):
+                    break
+                column = (j0 + e // wide % high) * n_phi + k0 + e % wide
                 out_cell[r, column] = ends[CELL, e]
                 out_instance[r, column] = ends[INSTANCE, e]
                 out_triangle[r, column] = ends[TRIANGLE, e]
@@ -158,7 +169,7 @@ def trace_hemispheres(  # type: ignore[no-untyped-def]
     stream : (n,) int64
         Number of each hemisphere's random sequence.
     n_theta, n_phi : int
-        Strata, multiples of 4.
+        Strata, 2 or multiples of 4.
     out_cell : (n, n_theta * n_phi) int32
         Ray (j, k) in column ``j n_phi + k``: a cell, `NOTHING` or `DETOUR`.
     out_distance : (n, n_rays) float32
@@ -166,9 +177,10 @@ def trace_hemispheres(  # type: ignore[no-untyped-def]
     out_instance, out_triangle : (n, n_rays) int32, out_uv : (n, n_rays, 2) float32
         The first surface; -1 where there is none.
     """
-    for r in prange(len(stream)):
-        _trace_hemisphere(
-            np.int64(r),
+    at_once = max(1, _PACKET // (n_theta * n_phi))
+    for part in prange((len(stream) + at_once - 1) // at_once):
+        _trace_some(
+            np.int64(part) * at_once,
             trace,
             cells,
             locator,
@@ -180,8 +192,8 @@ def trace_hemispheres(  # type: ignore[no-untyped-def]
             position,
             shading_normal,
             normal,
+            stream,
             seed,
-            stream[r],
             n_theta,
             n_phi,
             out_cell,
@@ -190,6 +202,35 @@ def trace_hemispheres(  # type: ignore[no-untyped-def]
             out_triangle,
             out_uv,
         )
+
+
+@parallel_kernel
+def mean_radiance(cell, adjusted, throughput, of_cells, out):  # type: ignore[no-untyped-def]
+    """Mean of what the rays of n hemispheres bring, to `out` (n, C), C a multiple of 3.
+
+    Parameters
+    ----------
+    cell, adjusted, throughput
+        Of `RecordRays`.
+    of_cells : (n_cells, C) float32
+        Radiance that cells send.
+    """
+    n, n_rays = cell.shape
+    share = np.float32(1.0 / n_rays)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        begin, end = chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)
+        a = np.searchsorted(adjusted, begin * n_rays)
+        for r in range(begin, end):
+            out[r, :] = np.float32(0.0)
+            for ray in range(n_rays):
+                is_adjusted = a < len(adjusted) and adjusted[a] == r * n_rays + ray
+                if cell[r, ray] >= 0:
+                    for c in range(out.shape[1]):
+                        light = of_cells[cell[r, ray], c]
+                        out[r, c] += light * throughput[a, c % 3] if is_adjusted else light
+                a += is_adjusted
+            for c in range(out.shape[1]):
+                out[r, c] *= share
 
 
 @parallel_kernel

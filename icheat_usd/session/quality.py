@@ -51,6 +51,21 @@ LIVE_FINE = replace(
 )
 FINAL = GatherSettings()
 
+#: A final frame in seconds: few rays of every camera sample, and what they leave of noise goes to the denoiser. Its
+#: gather samples are those of `QUICK_CELLS`.
+QUICK = GatherSettings(
+    1,
+    gather_rays=8,
+    light_samples=1,
+    dome_samples=2,
+    method="gathered",
+    edge_samples=1,
+    feature_samples=6,
+    cache=replace(FINAL.cache, near_paths=16),
+    denoise=True,
+)
+QUICK_CELLS = replace(PREVIEW, n_gather=8_192, rays_per_bounce_row=32)
+
 
 def coarse(quality: Quality) -> Quality:
     """What to show within seconds, while a preview of this quality is made."""

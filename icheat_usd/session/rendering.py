@@ -72,19 +72,20 @@ def render_film(session: Session, settings: GatherSettings, layers: Sequence[lay
     """
     if settings.denoise:
         denoiser()  # before hours of work
-    if settings.method != "cached" and any(layer.source == "records" for layer in layers):
+    if not settings.is_cached and any(layer.source == "records" for layer in layers):
         raise ImageError(f"the {settings.method} method places no records; leave them out, or choose the cached method")
     stack = session.stack
     scene = aovs.layer_scene(session.snapshot, stack)
     members = aovs.expanded(layers, scene)
     extras = aovs.needed(members, scene)
+    edits = [edit.path for edit in stack.active]
     if settings.denoise:
-        extras = with_denoising(extras)
+        extras = with_denoising(extras, edits)
     result = weighted_gather(
         (weight, gather_frame(moment, effort, extras)) for weight, moment, effort in _moments(session, settings)
     )
     if settings.denoise:
-        result = denoised(result, [edit.path for edit in stack.active], progress=session.progress)
+        result = denoised(result, edits, progress=session.progress)
     return aovs.make_film(result, members, scene, session.snapshot, _metadata(session, settings, stack))
 
 
@@ -141,10 +142,12 @@ def _moments(session: Session, settings: GatherSettings) -> Iterator[tuple[float
 def gather_frame(session: Session, settings: GatherSettings, extras: Extras, *, is_kept: bool = False) -> FinalGather:
     """The frame at one moment."""
     field = bind(session.stack, session.snapshot)
-    gather, radiance = None, None
-    if settings.method == "cached" or field.uses_incident or field.has_offset:
+    gather, radiance, sampler = None, None, None
+    if settings.uses_cells or field.uses_incident or field.has_offset:
         light = session.photon_light if settings.bounces == "photons" else session.cell_light
         gather, radiance = session.gather, light.radiance
+    if settings.method == "gathered":
+        sampler = session.light_sampler  # a third of a second less, and direct light hardly noisier
     return final_gather(
         session.snapshot,
         session.tracer,
@@ -152,6 +155,7 @@ def gather_frame(session: Session, settings: GatherSettings, extras: Extras, *, 
         settings=settings,
         gather=gather,
         gather_radiance=radiance,
+        sampler=sampler,
         extras=extras,
         is_kept=is_kept,
         progress=session.progress,

@@ -30,7 +30,7 @@ class FrameReplay:
     Parameters
     ----------
     settings : GatherSettings
-        Of the cached method, without denoising.
+        Of another method than brute, without denoising.
     layers : names
         As of `Session.render`, but for what the edits contribute one by one, what they make of single lights, and
         their mattes.
@@ -44,8 +44,8 @@ class FrameReplay:
     """
 
     def __init__(self, session: Session, settings: GatherSettings, layers: Sequence[str] = layer_names.DEFAULT) -> None:
-        if settings.method != "cached" or settings.denoise:
-            raise SettingsError("a frame can be replayed if it is rendered by the cached method and not denoised")
+        if not settings.uses_cells or settings.denoise:
+            raise SettingsError("a frame can be replayed if it is not rendered by the brute method, nor denoised")
         if len(list(moments(session, settings.samples_per_pixel, settings.edge_samples))) > 1:
             raise SettingsError(
                 f"{session.snapshot.camera.path}: a frame with motion blur cannot be replayed; close the camera's "

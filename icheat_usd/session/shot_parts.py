@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar, cast
 
 from icheat_usd.final_gather.photon_map import photon_cell_radiance
 from icheat_usd.final_gather.photons import PhotonSettings
-from icheat_usd.lighting import build_light_sampler
+from icheat_usd.lighting import LightSampler, build_light_sampler
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight import Relighter
 from icheat_usd.relight.relighter import light_view
@@ -132,6 +132,11 @@ class ShotParts:
             return gather_samples(self.snapshot, self.tracer, view, n=n, seed=seed)
 
         return self._kept("gather", ("tracer",), make)
+
+    @cached_property
+    def light_sampler(self) -> LightSampler:
+        """What lights of the gather samples are sampled by; it knows where around these they can be seen."""
+        return build_light_sampler(self.snapshot, self.tracer, self.gather.patch_points, self.quality.seed)
 
     @cached_property
     def training(self) -> F32:
@@ -268,6 +273,7 @@ class ShotParts:
                 n_bounces=quality.n_bounces,
                 light_samples=quality.light_samples,
                 seed=quality.seed,
+                sampler=self.light_sampler,
                 progress=self.progress,
             )
 
@@ -279,8 +285,8 @@ class ShotParts:
         quality = self.quality
         n_emitted = PHOTONS_PER_CELL * self.gather.n
         settings = PhotonSettings(n_emitted, n_bounces=quality.n_bounces, seed=quality.seed)
-        sampler = build_light_sampler(self.snapshot, self.tracer, self.gather.patch_points, quality.seed)
-        direct = cell_direct(self.snapshot, self.tracer, sampler, self.gather, quality.light_samples, quality.seed)
+        scene = self.snapshot, self.tracer, self.light_sampler, self.gather
+        direct = cell_direct(*scene, quality.light_samples, quality.seed)
         radiance = photon_cell_radiance(
             self.snapshot, self.tracer, self.gather, direct, settings, progress=self.progress
         )

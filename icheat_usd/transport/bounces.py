@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icheat_usd.kernels import rows as row_kernels
-from icheat_usd.lighting import build_light_sampler
+from icheat_usd.lighting import LightSampler, build_light_sampler
 from icheat_usd.materials import effective_albedo
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, cell_direct
@@ -156,6 +156,7 @@ def light_cells(
     n_bounces: int = 16,
     light_samples: int = 16,
     seed: int = 0,
+    sampler: LightSampler | None = None,
     progress: Progress = silent,
 ) -> CellLight:
     """Light the gather cells and solve the bounces between them.
@@ -166,9 +167,11 @@ def light_cells(
         Diffuse reflections before the last one; 1 is direct light once reflected.
     light_samples : int
         Shadow rays per light and patch point.
+    sampler : LightSampler, optional
+        One that knows where around the patches lights can be seen; learnt here by default.
     """
     progress("light the gather samples", 0.0)
-    sampler = build_light_sampler(snapshot, tracer, gather.patch_points, seed)
+    sampler = sampler or build_light_sampler(snapshot, tracer, gather.patch_points, seed)
     direct = cell_direct(snapshot, tracer, sampler, gather, light_samples, seed)
     progress("solve the bounces", 0.0)
     return CellLight(direct, solve_bounces(bounces, direct, n_bounces))

@@ -7,7 +7,10 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +18,7 @@ import pytest
 from icheat_usd.cli import main, sequence
 from icheat_usd.image.exr import read_exr
 from icheat_usd.resources import resource_path
-from icheat_usd.session import GatherSettings
+from icheat_usd.session import GatherSettings, Quality, quality
 from tests.cli.interruptible import start
 
 BOX = str(resource_path("sample_stages/cornell_box/shot.usda"))
@@ -89,7 +92,8 @@ def test_an_interrupted_render_leaves_nothing_behind(tmp_path: Path) -> None:
 def test_photons_and_the_denoiser_are_flags_of_render(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[GatherSettings] = []
 
-    def note(options: object, settings: GatherSettings) -> int:
+    def note(options: object, settings: GatherSettings, cells: Quality) -> int:
+        assert cells == quality.PREVIEW
         chosen.append(settings)
         return 0
 
@@ -97,3 +101,29 @@ def test_photons_and_the_denoiser_are_flags_of_render(monkeypatch: pytest.Monkey
     for flags in ([], ["--photons"], ["--denoise"]):
         assert main(["render", BOX, "-o", "x.exr", *flags]) == 0
     assert [(one.bounces, one.denoise) for one in chosen] == [("cells", False), ("photons", False), ("cells", True)]
+
+
+def test_a_quick_frame_is_a_choice_of_efforts_that_others_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[tuple[GatherSettings, Quality]] = []
+
+    def note(options: object, *effort: Any) -> int:
+        chosen.append(effort)  # type: ignore[arg-type]
+        return 0
+
+    monkeypatch.setattr(sequence, "render_frames", note)
+    assert main(["render", BOX, "-o", "x.exr", "--quick"]) == 0
+    assert main(["render", BOX, "-o", "x.exr", "--quick", "--rays", "32", "--edge-samples", "3", "--seed", "4"]) == 0
+    assert chosen[0] == (quality.QUICK, quality.QUICK_CELLS)
+    assert chosen[1] == (replace(quality.QUICK, gather_rays=32, edge_samples=3, seed=4), quality.QUICK_CELLS)
+
+
+@pytest.mark.skipif(find_spec("pyoidn") is None, reason="needs the extra 'denoise'")
+def test_a_quick_frame_is_near_a_slow_one(tmp_path: Path) -> None:
+    size = ["--width", "64", "--height", "64"]
+    means = []
+    for name, *flags in (("quick", "--quick"), ("slow", "--samples", "4")):
+        assert main(["render", BOX, "-o", str(tmp_path / f"{name}.exr"), *size, *flags]) == 0
+        image = read_exr(tmp_path / f"{name}.exr").layers["indirect"]
+        means.append(image.reshape(8, 8, 8, 8, 3).mean(axis=(1, 3)))
+    assert abs(means[0].mean() / means[1].mean() - 1) < 0.02
+    assert np.abs(means[0] / means[1] - 1).mean() < 0.05

@@ -183,5 +183,7 @@ def test_what_only_cached_light_has_is_no_option_of_the_brute_method(
 ) -> None:
     before = files(shot.parent)
     assert main(["render", str(shot), "-o", str(shot.parent / "f.exr"), "--method", "brute", *words]) == 2
-    assert f"no use for {words[0]}; leave that out" in capsys.readouterr().err
+    assert f"the brute method has no use for {words[0]}; leave that out" in capsys.readouterr().err
+    assert main(["render", str(shot), "-o", str(shot.parent / "f.exr"), "--quick", "--noise", "0.1"]) == 2
+    assert "the gathered method has no use for --noise; leave that out" in capsys.readouterr().err
     assert files(shot.parent) == before

@@ -35,7 +35,7 @@ def test_an_edit_multiplies_the_denoised_image_within_its_mask() -> None:
     )  # fmt: skip
     floor = Edit("/floor_edit", "scale", {"gain": 0.5}, select("/floor"), EVERYTHING)
     pipeline = Pipeline(SCENE, n_gather=1024, n_bounces=3)
-    extras = with_denoising(Extras(light_groups={"lamp": SCENE.light_paths}))
+    extras = with_denoising(Extras(light_groups={"lamp": SCENE.light_paths}), ["/edit", "/floor_edit"])
     result = pipeline.final(edit, floor, rays=8, samples=8, light_samples=2, extras=extras)
     found = denoised(result, ["/edit", "/resting", "/floor_edit"])
     masks = [mask_image(result, path) for path in ("/edit", "/floor_edit")]
@@ -65,4 +65,6 @@ def test_a_gather_without_masks_is_refused() -> None:
     pipeline = Pipeline(SCENE, n_gather=64, n_bounces=1)
     result = pipeline.final(rays=1, samples=1, light_samples=1, extras=NO_EXTRAS)
     with pytest.raises(ValueError, match="with_denoising"):
-        denoised(result, [])
+        denoised(result, ["/edit"])
+    assert with_denoising(NO_EXTRAS, []) is NO_EXTRAS
+    assert denoised(result, []).indirect.any()

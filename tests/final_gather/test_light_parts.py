@@ -9,6 +9,7 @@ import pytest
 
 from icheat_usd.edits.model import Edit
 from icheat_usd.final_gather import Extras, FinalGather
+from icheat_usd.final_gather.settings import METHODS
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from tests.pipeline import Pipeline, select
 from tests.scenes import Light, Material, Mesh, cornell_meshes, look_at, make_snapshot, quad
@@ -59,7 +60,7 @@ def render(room: SceneSnapshot, *edits: Edit, method: str = "cached") -> FinalGa
     return pipeline(room).final(*edits, method=method, samples=2, rays=8, light_samples=1, extras=extras)
 
 
-@pytest.mark.parametrize("method", ["cached", "brute"])
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("stack", STACKS)
 def test_parts_add_up_to_the_whole(stack: str, method: str) -> None:
     found = render(ROOM, *STACKS[stack], method=method)
@@ -81,7 +82,7 @@ def test_parts_add_up_to_the_whole(stack: str, method: str) -> None:
         assert np.allclose(base, edited, rtol=1e-5) == is_same
 
 
-@pytest.mark.parametrize("method", ["cached", "brute"])
+@pytest.mark.parametrize("method", METHODS)
 def test_what_no_light_sent_is_in_no_part(method: str) -> None:
     glow = Edit("/glow", "emit", {"color": (0.5, 0.2, 0.1)}, select("/floor", "/back"), WALLS)
     lift = Edit("/lift", "receive", {"scale": (0.5, 0.5, 0.5), "offset": (0.1, 0.1, 0.1)}, select("/floor"), EVERYTHING)
@@ -122,7 +123,7 @@ def test_an_edit_of_one_light_leaves_the_other_as_it_is() -> None:
 
 def test_the_usual_layers_are_those_without_parts() -> None:
     stack = STACKS["hsv and falloff"]
-    for method in ("cached", "brute"):
+    for method in METHODS:
         rich = render(ROOM, *stack, method=method)
         plain = pipeline().final(*stack, method=method, samples=2, rays=8, light_samples=1)
         for layer in ("direct", "indirect", "indirect_edited"):

@@ -13,6 +13,7 @@ from icheat_usd.errors import ImageError
 from icheat_usd.resources import resource_path
 from icheat_usd.session import GatherSettings, Quality, Session
 from icheat_usd.session.layer_names import DEFAULT
+from icheat_usd.session.quality import QUICK
 
 BOX = resource_path("sample_stages/cornell_box/shot.usda")
 EFFORT = GatherSettings(samples_per_pixel=2, edge_samples=0)
@@ -27,9 +28,9 @@ def test_help_states_the_defaults_that_there_are(capsys: pytest.CaptureFixture[s
     assert main(["render", "--help"]) == 0
     text, usual = " ".join(capsys.readouterr().out.split()), GatherSettings()
     for said in (
-        f"camera samples a pixel; default {usual.samples_per_pixel} ",
-        f"pixels with edges; default {usual.edge_samples} ",
-        f"no light is cached; default {usual.gather_rays} ",
+        f"camera samples a pixel; default {usual.samples_per_pixel} (quick: {QUICK.samples_per_pixel}) ",
+        f"pixels with edges; default {usual.edge_samples} (quick: {QUICK.edge_samples}) ",
+        f"no light is cached; default {usual.gather_rays} (quick: {QUICK.gather_rays}) ",
         f"before the last one; default {usual.n_bounces}",
         f"rays are traced; default {usual.cache.noise} ",
         f"default {usual.pixel_filter} ",

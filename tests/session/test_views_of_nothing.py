@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icheat_usd.final_gather.settings import METHODS
 from icheat_usd.session import DRAFT, GatherSettings, Quality, Session
 from icheat_usd.session.layer_names import FAMILIES, LAYERS
 from icheat_usd.session.live import LiveSession
@@ -53,7 +54,7 @@ def test_a_surface_that_sees_no_other_has_packed_rows_without_light(tmp_path: Pa
     np.testing.assert_allclose(found[-1, 6], 0.18 * np.float32([0.4, 0.8, 1.6]), rtol=0.02)
 
 
-@pytest.mark.parametrize("method", ["cached", "brute"])
+@pytest.mark.parametrize("method", METHODS)
 def test_every_layer_of_a_camera_that_sees_no_surface(method: str, tmp_path: Path) -> None:
     stage = tmp_path / "stage.usda"
     stage.write_text(ROOM.replace("(0, 0, 1.9)", "(0, 0, -9)").replace("    def Camera", SKY))

@@ -58,8 +58,8 @@ class Frame:
         return bind(stack, self.snapshot)
 
     def render(self, field: EditField, *, is_kept: bool = False) -> tuple[FinalGather, float]:
-        """The frame, and the seconds that it took with all that it needs but the tracer."""
-        is_lit = self.effort.settings.method == "cached" or field.uses_incident or field.has_offset
+        """The frame before denoising, and the seconds that it took with all that it needs but the tracer."""
+        is_lit = self.effort.settings.uses_cells or field.uses_incident or field.has_offset
         _ = self.tracer
         start = time.perf_counter()
         gather, radiance = (self.gather, self.cell_radiance) if is_lit else (None, None)
@@ -70,6 +70,7 @@ class Frame:
             settings=self.effort.settings,
             gather=gather,
             gather_radiance=radiance,
+            sampler=self._parts.light_sampler if self.effort.settings.method == "gathered" else None,
             is_kept=is_kept,
         )
         return found, time.perf_counter() - start

