@@ -34,6 +34,8 @@ class Band(NamedTuple):
     view: ViewSamples
     edges: I64  #: (m,) ascending: pixels with more samples than the others
     measured: F32  #: (n,) of each view sample; zeros where nothing is measured
+    seen: F64  #: (n_pixels, 1) share of each pixel's camera samples that end on a surface
+    more: ViewSamples | None = None  #: of pixels with edges, which tell of surfaces and of the sky, and get no light
 
 
 class CameraPass:
@@ -84,7 +86,7 @@ class CameraPass:
                 self._kept[number] = view, measured
             if self._n_edge or self._settings.feature_samples:
                 looks.append(look_over(view, self._snapshot.camera, pixels))
-            yield Band(pixels, view, _NO_EDGES, measured)
+            yield Band(pixels, view, _NO_EDGES, measured, self._seen(view, pixels, _NO_EDGES))
         if looks:
             self._edges = edge_pixels(join_looks(*looks), self._snapshot.camera.width)
 
@@ -107,15 +109,30 @@ class CameraPass:
                 both = np.concatenate([measured, self._measure(more)])
                 view, order = _joined(view, more, edges)
                 measured = both[order]
-            yield Band(pixels, view, edges, measured)
+            seen, n = self._seen(view, pixels, edges), self._settings.feature_samples
+            more = self._trace(edges, n, self._first_edge + self._n_edge) if n and len(edges) else None
+            if more is not None:
+                share = n / (self._n + self._n_edge + n)
+                rows = edges - pixels[0]
+                whole = seen.copy()
+                whole[rows] += share * (np.bincount(more.pixel, minlength=edges[-1] + 1)[edges, None] / n - seen[rows])
+                view = _with_sky_of(view, more, edges, share, whole, seen, pixels[0])
+                seen = whole
+            yield Band(pixels, view, edges, measured, seen, more)
+
+    def _seen(self, view: ViewSamples, pixels: tuple[int, int], edges: I64) -> F64:
+        first, end = pixels
+        number = np.full(end - first, self._n)
+        if len(edges):
+            number[edges - first] += self._n_edge
+        return (np.bincount(view.pixel - first, minlength=end - first) / number)[:, None]
 
     def features(self, band: Band) -> tuple[F64, F64]:
         """Mean albedo and shading normal of the pixels of a band, (n_pixels, 3) each; with edges, of more samples."""
-        view, n = band.view, self._settings.feature_samples
+        view, more = band.view, band.more
         albedo = average(view, view.points.albedo, band.pixels)
         normal = average(view, view.points.shading_normal, band.pixels)
-        if n and len(band.edges):
-            more = self._trace(band.edges, n, self._first_edge + self._n_edge)
+        if more is not None:
             # Of samples that see a surface.
             seen, seen_more = (np.bincount(one.pixel, minlength=view.width * view.height) for one in (view, more))
             share = (seen_more / np.maximum(seen + seen_more, 1))[band.edges, None]
@@ -136,6 +153,33 @@ class CameraPass:
             max_splits=0,
             pixels=pixels,
         )
+
+
+def _with_sky_of(
+    view: ViewSamples, more: ViewSamples, pixels: I64, share: float, seen: F64, seen_before: F64, first: int
+) -> ViewSamples:
+    """A view with the sky of both in `pixels`, whose surfaces fill as much of these as both see of them.
+
+    Parameters
+    ----------
+    share : float
+        What samples of `more` are of all.
+    seen, seen_before : (n_pixels, 1) float64
+        Shares of samples on surfaces, of both and of the view, from pixel `first` on.
+    """
+    has_more = np.zeros(view.width * view.height, np.bool_)
+    has_more[pixels] = True
+    kept, rest = np.where(has_more, np.float32(1 - share), np.float32(1)), np.float32(share)
+    filled = np.divide(seen, seen_before, out=np.ones_like(seen), where=seen_before > 0)
+    background = view.background * kept[:, None]
+    background[pixels] += more.background[pixels] * rest
+    sky = SkyPaths(
+        np.concatenate([view.sky.pixel, more.sky.pixel]),
+        np.concatenate([view.sky.throughput * kept[view.sky.pixel, None], more.sky.throughput * rest]),
+        np.concatenate([view.sky.direction, more.sky.direction]),
+    )
+    throughput = view.throughput * np.take(filled, view.pixel - first, axis=0).astype(np.float32)
+    return replace(view, throughput=throughput, background=background, sky=sky)
 
 
 def draws_of(view: ViewSamples, settings: GatherSettings) -> I64:

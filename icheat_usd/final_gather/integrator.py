@@ -69,7 +69,7 @@ PILOT_ROWS, PILOT_COLUMNS = 24, 128
 
 @dataclass(frozen=True, eq=False)
 class FinalGather:
-    """Image layers, (height, width, 3) float64, scene-linear; `depth` is (height, width, 1)."""
+    """Image layers, (height, width, 3) float64, scene-linear; `depth` and `seen` are (height, width, 1)."""
 
     background: F64
     emission: F64
@@ -79,6 +79,7 @@ class FinalGather:
     albedo: F64
     normal: F64
     depth: F64
+    seen: F64  #: share of each pixel's camera samples that end on a surface
     contributions: Mapping[str, F64] = field(default_factory=lambda: MappingProxyType({}))
     #: what each edit adds to the edits before it, by path; if asked for
     light_groups: Mapping[tuple[str, str], F64] = field(default_factory=lambda: MappingProxyType({}))
@@ -189,8 +190,7 @@ def final_gather(
     for number, (part, per_light) in enumerate(direct.bands(camera.all())):
         progress("gather", number / len(camera.bands))
         own_seed = int(hash_combine(seed, part.pixels[0]))
-        features = camera.features(part)
-        bands.append(_band(gatherer, find, part, per_light, features, draws_of(part.view, settings), own_seed, extras))
+        bands.append(_band(gatherer, find, camera, part, per_light, draws_of(part.view, settings), own_seed, extras))
         if replay is not None:
             kept.append(KeptBand(part.pixels, part.view))
     progress("gather", 1.0)
@@ -308,24 +308,26 @@ def _solution(field: EditField, gather: GatherSamples | None, per_light: F32 | N
 def _band(
     gatherer: Gatherer,
     find: FindLight,
+    camera: CameraPass,
     band: Band,
     per_light: F32,
-    features: tuple[F64, F64],
     draws: I64,
     seed: int,
     extras: Extras,
 ) -> _Band:
     pixels, view = band.pixels, band.view
     light = find(band, view.stream.astype(np.int64) & 0x7FFFFFFF, draws, seed)
+    albedo, normal = camera.features(band)
     usual = {
         "background": view.background[slice(*pixels)].astype(np.float64),
         "emission": develop(view, view.points.emission, pixels),
         "direct": develop(view, per_light.sum(axis=0), pixels),
         "indirect": develop(view, light.base, pixels),
         "indirect_edited": develop(view, light.edited, pixels),
-        "albedo": features[0],
-        "normal": features[1],
+        "albedo": albedo,
+        "normal": normal,
         "depth": average(view, view.depth[:, None], pixels),
+        "seen": band.seen,
     }
     return _Band(
         usual,

@@ -12,7 +12,7 @@ from icheat_usd.image.cryptomatte import Coverage, weighted_sum
 from icheat_usd.scene import F64
 
 #: Layers of light: zero where nothing is seen.
-_LIGHT = ("background", "emission", "direct", "indirect", "indirect_edited")
+_LIGHT = ("background", "emission", "direct", "indirect", "indirect_edited", "seen")
 #: Layers of surfaces: moments at which a pixel shows none have no say in them.
 _SURFACE = ("albedo", "normal", "depth")
 
@@ -61,6 +61,7 @@ def weighted_gather(moments: Iterable[tuple[float, FinalGather]]) -> FinalGather
         albedo=layers["albedo"],
         normal=layers["normal"],
         depth=layers["depth"],
+        seen=layers["seen"],
         contributions=groups["contributions"],
         light_groups=groups["light_groups"],
         coverage=mattes,

@@ -48,8 +48,8 @@ class GatherSettings:
     #: gather samples, "photons" by light traced forwards.
     bounces: str = "cells"
     denoise: bool = False  #: by Open Image Denoise, which must be installed
-    #: More camera samples in pixels with edges that only albedo and normal are taken of: what a denoiser takes edges
-    #: from. Of no use to other images.
+    #: More camera samples in pixels with edges, which no light is found for: they say where the sky begins, and a
+    #: denoiser takes edges from their albedo and normal.
     feature_samples: int = 0
 
     def __post_init__(self) -> None:

@@ -8,17 +8,17 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.final_gather import GatherSettings
+from icheat_usd.final_gather import Extras, FinalGather, GatherSettings, final_gather
 from icheat_usd.final_gather.camera_pass import CameraPass
 from icheat_usd.samples.develop import average
-from icheat_usd.scene import F64
+from icheat_usd.scene import F64, LightKind
 from icheat_usd.tracing import build_tracer
 from tests.agreement import compare
 from tests.final_gather.test_edits import EVERYTHING, WHITE, previews
 from tests.final_gather.test_irradiance_cache import SCENE, in_cornell
 from tests.final_gather.test_operations import edit
 from tests.pipeline import Pipeline
-from tests.scenes import cornell
+from tests.scenes import Light, Material, Mesh, cornell, look_at, make_snapshot, quad, rotation
 
 STRATA = [(2, 2), (2, 4), (4, 4), (4, 8)]
 
@@ -86,6 +86,41 @@ def test_the_picture_has_the_same_bits_with_one_thread() -> None:
     assert (both.indirect != both.indirect_edited).any()
     for layer in ("direct", "indirect", "indirect_edited", "albedo", "normal"):
         np.testing.assert_array_equal(getattr(both, layer), getattr(alone, layer))
+
+
+@pytest.mark.parametrize("edge_samples", [0, 2])
+def test_silhouettes_are_those_of_all_samples(edge_samples: int) -> None:
+    """A block before a sky: what is seen of either, and light that is the same everywhere on the block."""
+    scene = make_snapshot(
+        [Mesh(quad(1.0), Material(0.5), (rotation((0, 0, 1), 30) @ rotation((1, 0, 0), 90),))],
+        lights=[Light(LightKind.DOME, 1.0)],
+        camera=look_at((0, 0, 3), (0, 0, 0), fov=40, width=24, height=24),
+    )
+    parts = Pipeline(scene, n_gather=64, n_bounces=1)
+
+    def render(**effort: int) -> FinalGather:
+        settings = GatherSettings(2, gather_rays=4, light_samples=64, n_bounces=1, method="gathered", **effort)
+        return final_gather(
+            scene,
+            parts.tracer,
+            parts.field(),
+            settings=settings,
+            gather=parts.gather,
+            gather_radiance=parts.cell_light.radiance,
+            extras=Extras(objects=True),
+        )
+
+    apart = render(edge_samples=edge_samples, feature_samples=6)
+    together = render(edge_samples=edge_samples + 6)
+    assert ((together.seen > 0) & (together.seen < 1)).sum() > 20
+    np.testing.assert_allclose(apart.seen, together.seen, atol=1e-6)
+    np.testing.assert_allclose(apart.background, together.background, atol=1e-6)
+    lit = render(edge_samples=edge_samples).seen > 0
+    np.testing.assert_allclose(*((one.direct * lit).sum() for one in (apart, together)), rtol=0.02)
+    shares = [
+        np.bincount(one.coverage["object"].pixel, one.coverage["object"].share, 24 * 24) for one in (apart, together)
+    ]
+    np.testing.assert_allclose(*(one * lit.ravel() for one in shares), atol=1e-6)
 
 
 @pytest.mark.parametrize("edge_samples", [0, 2])

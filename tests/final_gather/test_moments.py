@@ -14,7 +14,7 @@ def image(value: float, depth: float, **more: object) -> FinalGather:
     far = np.full((1, 2, 1), depth)
     far[0, 1] = 0.0
     seen = np.where(far > 0, 0.5 * value, 0.0) * np.ones(3)
-    return FinalGather(light, light, light, light, 2 * light, seen, seen, far, **more)  # type: ignore[arg-type]
+    return FinalGather(light, light, light, light, 2 * light, seen, seen, far, (far > 0).astype(float), **more)  # type: ignore[arg-type]
 
 
 def test_light_is_the_weighted_mean_and_surfaces_count_where_they_are_seen() -> None:

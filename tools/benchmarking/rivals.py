@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icheat_usd.errors import ImageError
-from icheat_usd.final_gather import FinalGather, GatherSettings
+from icheat_usd.final_gather import FinalGather, GatherSettings, denoised_layer
 from icheat_usd.image.denoise import denoise
 from icheat_usd.samples import view_samples
 from icheat_usd.samples.develop import average
@@ -186,11 +186,10 @@ def _ours(stand: _Stand, chosen: dict[str, RenderEffort]) -> dict[str, Any]:
 
 def _denoised_ours(render: _Render, found: FinalGather) -> _Render:
     """As `_denoised` has it, but with the features of the frame."""
-    albedo, normal = found.albedo.astype(np.float32), found.normal.astype(np.float32)
     start = time.perf_counter()
-    indirect = denoise(found.indirect.astype(np.float32), albedo, normal).astype(np.float64)
+    indirect = denoised_layer(found, found.indirect)
     spent = time.perf_counter() - start
-    direct = denoise(found.direct.astype(np.float32), albedo, normal)
+    direct = denoised_layer(found, found.direct)
     return _Render(render.label, render.seconds + spent, indirect, direct + indirect)
 
 
