@@ -105,13 +105,14 @@ class CameraPass:
             begin, end = np.searchsorted(self._edges, pixels)
             edges = self._edges[begin:end]
             if len(edges) and self._n_edge:
-                more = self._trace(edges, self._n_edge, self._first_edge)
-                both = np.concatenate([measured, self._measure(more)])
-                view, order = _joined(view, more, edges)
+                further = self._trace(edges, self._n_edge, self._first_edge)
+                both = np.concatenate([measured, self._measure(further)])
+                view, order = _joined(view, further, edges)
                 measured = both[order]
             seen, n = self._seen(view, pixels, edges), self._settings.feature_samples
-            more = self._trace(edges, n, self._first_edge + self._n_edge) if n and len(edges) else None
-            if more is not None:
+            more: ViewSamples | None = None
+            if n and len(edges):
+                more = self._trace(edges, n, self._first_edge + self._n_edge)
                 share = n / (self._n + self._n_edge + n)
                 rows = edges - pixels[0]
                 whole = seen.copy()

@@ -45,41 +45,35 @@ def denoised(result: FinalGather, edits: Sequence[str], *, progress: Progress = 
     if edits and not {"object", "edit"} <= result.coverage.keys():
         raise ValueError("a final gather can only be denoised if it was rendered with the extras of with_denoising()")
     progress("denoise", 0.0)
-    albedo, normal = (np.ascontiguousarray(layer, np.float32) for layer in (result.albedo, result.normal))
     clean = partial(denoised_layer, result)
     there = [path for path in edits if path in result.contributions]
-    images = [EditImage(mask_image(result, path), _whole(result, result.contributions[path])) for path in there]
-    whole = denoise_edited(_whole(result, result.indirect), images, albedo, normal)
-    unedited, edited, *edits_alone = (layer * result.seen for layer in (whole.unedited, whole.edited, *whole.changes))
-    changes = dict(zip(there, edits_alone, strict=True))
+    images = [EditImage(mask_image(result, path), result.contributions[path].astype(np.float32)) for path in there]
+    light = denoise_edited(result.indirect.astype(np.float32), images, *_features(result))
+    changes = dict(zip(there, light.changes, strict=True))
     found = replace(
         result,
         direct=clean(result.direct),
-        indirect=unedited,
-        indirect_edited=edited,
-        contributions={path: changes.get(path, old) for path, old in result.contributions.items()},
-        light_groups=_groups(result, unedited, edited, clean),
+        indirect=light.unedited.astype(np.float64),
+        indirect_edited=light.edited.astype(np.float64),
+        contributions={path: changes.get(path, old).astype(np.float64) for path, old in result.contributions.items()},
+        light_groups=_groups(result, light.unedited, light.edited, clean),
     )
     progress("denoise", 1.0)
     return found
 
 
 def denoised_layer(result: FinalGather, layer: F64) -> F64:
-    """One layer of light, (height, width, 3), without its noise.
-
-    Features are those of surfaces, and so must be the light: where a pixel shows some of the sky beside a surface,
-    the denoiser sees the light that a whole pixel of it would have.
-    """
-    albedo, normal = (np.ascontiguousarray(feature, np.float32) for feature in (result.albedo, result.normal))
-    return denoise(_whole(result, layer), albedo, normal) * result.seen
+    """One layer of light, (height, width, 3), without its noise."""
+    return denoise(layer.astype(np.float32), *_features(result)).astype(np.float64)
 
 
-def _whole(result: FinalGather, layer: F64) -> F32:
-    """Light of pixels as if what they show of surfaces filled them."""
-    return np.divide(layer, result.seen, out=np.zeros_like(layer), where=result.seen > 0).astype(np.float32)
+def _features(result: FinalGather) -> tuple[F32, F32]:
+    """Albedo and normal, where a pixel shows the sky beside a surface as little of them as there is of its light."""
+    albedo, normal = ((feature * result.seen).astype(np.float32) for feature in (result.albedo, result.normal))
+    return albedo, normal
 
 
-def _groups(result: FinalGather, unedited: F64, edited: F64, clean: Callable[[F64], F64]) -> dict[tuple[str, str], F64]:
+def _groups(result: FinalGather, unedited: F32, edited: F32, clean: Callable[[F64], F64]) -> dict[tuple[str, str], F64]:
     shares = {"indirect": (result.indirect, unedited), "indirect_edited": (result.indirect_edited, edited)}
     found = {}
     for (kind, name), layer in result.light_groups.items():
