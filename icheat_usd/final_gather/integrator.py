@@ -1,7 +1,8 @@
-"""Final gathering: diffuse light from an irradiance cache, or by brute force from every camera sample.
+"""Final gathering: diffuse light from an irradiance cache, by a few rays of every camera sample, or by brute force.
 
-The brute-force way has no cache and takes earlier bounces from paths. Slow and
-unbiased, apart from the limits below; what is faster is measured against it.
+Both the cache and the few rays take earlier bounces from the gather samples.
+The brute-force way takes them from paths: slow and unbiased, apart from the
+limits below; what is faster is measured against it.
 
 Limits: all reflections before the last are diffuse; caustics through glass are
 left out of the lighting, as shadow rays pass straight through it. What curves
@@ -237,7 +238,7 @@ def _from_cells(
         records = _place_records(cache, snapshot, camera, settings, progress)
     else:
         for _ in camera.first():
-            pass  # Edges are found, and nothing is placed.
+            pass  # edges are found, and nothing is placed
     return CachedGather(gatherer, cache, settings.glossy_rays, settings.own_strata, is_kept=is_kept), records
 
 
