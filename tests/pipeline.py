@@ -109,11 +109,20 @@ class Pipeline:
         light_samples: int = 16,
         seed: int = 0,
         edge_samples: int = 0,
+        feature_samples: int = 0,
         cache: CacheSettings = TINY,
         extras: Extras = NO_EXTRAS,
     ) -> FinalGather:
         settings = GatherSettings(
-            samples, rays, light_samples, self.n_bounces, seed, method=method, edge_samples=edge_samples, cache=cache
+            samples,
+            rays,
+            light_samples,
+            self.n_bounces,
+            seed,
+            method=method,
+            edge_samples=edge_samples,
+            feature_samples=feature_samples,
+            cache=cache,
         )
         field = self.field(*edits)
         needs = settings.uses_cells or field.uses_incident or field.has_offset

@@ -109,16 +109,11 @@ class CameraPass:
                 both = np.concatenate([measured, self._measure(further)])
                 view, order = _joined(view, further, edges)
                 measured = both[order]
-            seen, n = self._seen(view, pixels, edges), self._settings.feature_samples
-            more: ViewSamples | None = None
-            if n and len(edges):
-                more = self._trace(edges, n, self._first_edge + self._n_edge)
-                share = n / (self._n + self._n_edge + n)
-                rows = edges - pixels[0]
-                whole = seen.copy()
-                whole[rows] += share * (np.bincount(more.pixel, minlength=edges[-1] + 1)[edges, None] / n - seen[rows])
-                view = _with_sky_of(view, more, edges, share, whole, seen, pixels[0])
-                seen = whole
+            seen, more = self._seen(view, pixels, edges), None
+            if len(edges) and self._settings.feature_samples:
+                more = self._trace(edges, self._settings.feature_samples, self._first_edge + self._n_edge)
+                share = more.samples_per_pixel / (self._n + self._n_edge + more.samples_per_pixel)
+                view, seen = _with_sky_of(view, more, edges, share, seen, pixels[0])
             yield Band(pixels, view, edges, measured, seen, more)
 
     def _seen(self, view: ViewSamples, pixels: tuple[int, int], edges: I64) -> F64:
@@ -157,21 +152,30 @@ class CameraPass:
 
 
 def _with_sky_of(
-    view: ViewSamples, more: ViewSamples, pixels: I64, share: float, seen: F64, seen_before: F64, first: int
-) -> ViewSamples:
+    view: ViewSamples, more: ViewSamples, pixels: I64, share: float, seen: F64, first: int
+) -> tuple[ViewSamples, F64]:
     """A view with the sky of both in `pixels`, whose surfaces fill as much of these as both see of them.
 
     Parameters
     ----------
     share : float
         What samples of `more` are of all.
-    seen, seen_before : (n_pixels, 1) float64
-        Shares of samples on surfaces, of both and of the view, from pixel `first` on.
+    seen : (n_pixels, 1) float64
+        Shares of the view's samples that end on surfaces, from pixel `first` on.
+
+    Returns
+    -------
+    (ViewSamples, (n_pixels, 1) float64)
+        And the shares of both. Where the view has none its pixel stays without light.
     """
+    seen_more = np.bincount(more.pixel, minlength=view.width * view.height)[pixels, None] / more.samples_per_pixel
+    before, rows = seen, pixels - first
+    seen = before.copy()
+    seen[rows] += share * (seen_more - before[rows])
+    filled = np.divide(seen, before, out=np.ones_like(seen), where=before > 0)
     has_more = np.zeros(view.width * view.height, np.bool_)
     has_more[pixels] = True
     kept, rest = np.where(has_more, np.float32(1 - share), np.float32(1)), np.float32(share)
-    filled = np.divide(seen, seen_before, out=np.ones_like(seen), where=seen_before > 0)
     background = view.background * kept[:, None]
     background[pixels] += more.background[pixels] * rest
     sky = SkyPaths(
@@ -180,7 +184,7 @@ def _with_sky_of(
         np.concatenate([view.sky.direction, more.sky.direction]),
     )
     throughput = view.throughput * np.take(filled, view.pixel - first, axis=0).astype(np.float32)
-    return replace(view, throughput=throughput, background=background, sky=sky)
+    return replace(view, throughput=throughput, background=background, sky=sky), seen
 
 
 def draws_of(view: ViewSamples, settings: GatherSettings) -> I64:

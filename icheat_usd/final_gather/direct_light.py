@@ -3,8 +3,8 @@
 All camera samples of a pixel draw from one low-discrepancy sequence for each
 light, so that the pixel's rays are stratified over the light together; pixels
 with more camera samples take fewer rays at each. Penumbrae are found by the
-first rays of a pixel and of those around it, and all rays count. A denoiser wants noise that is alike everywhere,
-and gets as many rays of every pixel.
+first rays of a pixel and of those around it, and all rays count. A denoiser
+wants noise that is alike everywhere, and gets as many rays of every pixel.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.final_gather import Extras, FinalGather, GatherSettings, final_gather
+from icheat_usd.final_gather import Extras, FinalGather, GatherSettings
 from icheat_usd.final_gather.camera_pass import CameraPass
 from icheat_usd.samples.develop import average
 from icheat_usd.scene import F64, LightKind
@@ -99,16 +99,8 @@ def test_silhouettes_are_those_of_all_samples(edge_samples: int) -> None:
     parts = Pipeline(scene, n_gather=64, n_bounces=1)
 
     def render(**effort: int) -> FinalGather:
-        settings = GatherSettings(2, gather_rays=4, light_samples=64, n_bounces=1, method="gathered", **effort)
-        return final_gather(
-            scene,
-            parts.tracer,
-            parts.field(),
-            settings=settings,
-            gather=parts.gather,
-            gather_radiance=parts.cell_light.radiance,
-            extras=Extras(objects=True),
-        )
+        extras = Extras(objects=True)
+        return parts.final(method="gathered", samples=2, rays=4, light_samples=64, extras=extras, **effort)
 
     apart = render(edge_samples=edge_samples, feature_samples=6)
     together = render(edge_samples=edge_samples + 6)

@@ -142,7 +142,7 @@ def _at_equal_time(compared: dict[str, Any]) -> list[str]:
 
 
 def _goals(stage: str, compared: dict[str, Any]) -> list[str]:
-    """Of cached efforts: brute force is there to be compared with."""
+    """Of all efforts but one: brute force is there to be compared with."""
     lines = []
     found = {name: gain for name, gain in compared["efficiency"].get("rel_mse", {}).items() if "brute" not in name}
     if found:
