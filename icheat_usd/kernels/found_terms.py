@@ -27,6 +27,7 @@ class TermColumns(NamedTuple):
     """Terms of all tiles by their coefficients."""
 
     begin: NDArray[np.int64]  #: (m + 1,) first term of each coefficient
+    most: NDArray[np.float32]  #: (m,) largest worth of its terms, 0 where there is none
     worth: NDArray[np.float32]  #: (n,) descending
     tile: NDArray[np.int32]  #: (n,)
     pair: NDArray[np.int32]  #: (n,) number of the pair of coefficients in `PairedTiles`
@@ -37,10 +38,11 @@ def order_terms(tiles: PairedTiles, m: int) -> TermColumns:
     begin = np.empty(m + 1, np.int64)
     count_columns(tiles.index, tiles.worth, begin)
     n = int(begin[-1])
-    columns = TermColumns(begin, np.empty(n, np.float32), np.empty(n, np.int32), np.empty(n, np.int32))
-    fill_columns(tiles.tile_begin, tiles.index, tiles.worth, *columns)
-    sort_columns(*columns)
-    return columns
+    terms = np.empty(n, np.float32), np.empty(n, np.int32), np.empty(n, np.int32)
+    fill_columns(tiles.tile_begin, tiles.index, tiles.worth, begin, *terms)
+    most = np.zeros(m, np.float32)
+    sort_columns(begin, *terms, most)
+    return TermColumns(begin, most, *terms)
 
 
 def find_of_jobs(
@@ -60,13 +62,11 @@ def find_of_jobs(
     found_begin : (n + 1,) int64
     found : (n_found,) int32
     """
-    n, is_used = len(tile), np.zeros(len(size), np.bool_)
-    is_used[version] = True
-    used = np.flatnonzero(is_used)
-    none = np.arange(len(used))
+    used, row = np.unique(version, return_inverse=True)
+    n, none = len(tile), np.arange(len(used))
     job_of = np.empty((len(used), n_tiles), np.int32)
     job_of[:] = n + none[:, None]
-    job_of[(np.cumsum(is_used) - 1)[version], tile] = np.arange(n)
+    job_of[row, tile] = np.arange(n)
     count = np.zeros(n + len(used), np.int64)
     find_terms(*columns, size, least, used, job_of, count, np.empty(0, np.int32))
     begin = np.concatenate([[0], np.cumsum(count[:n])]).astype(np.int64)
@@ -98,21 +98,23 @@ def fill_columns(tile_begin, index, worth, begin, out_worth, out_tile, out_pair)
 
 
 @parallel_kernel
-def sort_columns(begin, worth, tile, pair):  # type: ignore[no-untyped-def]
+def sort_columns(begin, worth, tile, pair, most):  # type: ignore[no-untyped-def]
     """Put the terms of each coefficient in order of what they are worth, as in `TermColumns`."""
     for k in prange(len(begin) - 1):
         some = slice(begin[k], begin[k + 1])
         order = np.argsort(-worth[some], kind="mergesort")
         worth[some], tile[some], pair[some] = worth[some][order], tile[some][order], pair[some][order]
+        if begin[k] < begin[k + 1]:
+            most[k] = worth[begin[k]]
 
 
 @kernel
-def _walk(begin, worth, tile, pair, size, least, n_jobs, job_of, place, found):  # type: ignore[no-untyped-def]
+def _walk(begin, most, worth, tile, pair, size, least, n_jobs, job_of, place, found):  # type: ignore[no-untyped-def]
     """Number of the pair of each large term of one version, to ``found[place[job]]``, of which each moves on."""
     n = 1 if least == np.inf else len(size)  # the mean alone, which is the first
     counts = len(found) == 0
     for k in range(n):
-        if not size[k] > 0:
+        if not size[k] * most[k] >= least:
             continue
         for i in range(begin[k], begin[k + 1]):
             if not size[k] * worth[i] >= least:
@@ -157,15 +159,15 @@ def _prepare(numbers, value):  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def find_terms(begin, worth, tile, pair, size, least, versions, job_of, place, found):  # type: ignore[no-untyped-def]
+def find_terms(begin, most, worth, tile, pair, size, least, versions, job_of, place, found):  # type: ignore[no-untyped-def]
     """Pairs of coefficients with a term ``worth * size`` that is `least` or more, of some tiles and versions.
 
     Parameters
     ----------
-    begin, worth, tile, pair
+    begin, most, worth, tile, pair
         `TermColumns`.
     size : (n_versions, m) float32, least : (n_versions,) float32
-        As `multiply_terms` takes them.
+        As `multiply_terms` takes them; `least` is above 0.
     versions : (n,) int64
         Which are meant.
     job_of : (n, n_tiles) int32
@@ -178,7 +180,7 @@ def find_terms(begin, worth, tile, pair, size, least, versions, job_of, place, f
     n = len(versions)
     for i in prange(n):
         v = versions[i]
-        _walk(begin, worth, tile, pair, size[v], least[v], len(place) - n, job_of[i], place, found)
+        _walk(begin, most, worth, tile, pair, size[v], least[v], len(place) - n, job_of[i], place, found)
 
 
 @parallel_kernel

@@ -535,6 +535,27 @@ def store_words(builder: Any, values: Any) -> None:
     builder.store(values[1], _at(builder, values[0], _W32X), align=4)
 
 
+@_operation(types.uint64, types.int64)
+def load_word(builder: Any, values: Any) -> Any:
+    """Eight bytes from an address, the first of them lowest."""
+    return builder.load(_at(builder, values[0], ir.IntType(64)), align=1)
+
+
+@_operation(types.int64, types.uint64)
+def lowest_bit(builder: Any, values: Any) -> Any:
+    """Number of the lowest bit that is set; one is."""
+    i64, flag = ir.IntType(64), ir.IntType(1)
+    function = builder.module.declare_intrinsic("llvm.cttz", [i64], ir.FunctionType(i64, [i64, flag]))
+    return builder.call(function, [values[0], ir.Constant(flag, 1)])
+
+
+@_operation(types.void, types.int64)
+def set_byte(builder: Any, values: Any) -> None:
+    """1 to the byte at an address."""
+    byte = ir.IntType(8)
+    builder.store(ir.Constant(byte, 1), _at(builder, values[0], byte), align=1)
+
+
 @_operation(types.void, types.int64)
 def fetch(builder: Any, values: Any) -> None:
     """Ask for the cache line of an address; it will be read soon."""

@@ -11,6 +11,7 @@ import numpy as np
 from icheat_usd.kernels import version_products as kernels
 from icheat_usd.kernels.found_terms import TermColumns, find_of_jobs, multiply_found, order_terms
 from icheat_usd.kernels.large_terms import multiply_terms
+from icheat_usd.kernels.marked_terms import WORD, mark_terms, multiply_marked
 from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
 from icheat_usd.kernels.term_energy import least_of_versions
@@ -26,7 +27,7 @@ _MANY_CELLS = 4096
 SMALL_BYTES = 8_000_000
 #: What is left out is expected to be off by as much of the image if its terms have random signs. They do not quite:
 #: measured with training lights, it adds up to one to four times as much.
-LEFT_OUT = 0.003
+LEFT_OUT = 0.0015
 #: The same for each version alone, however many there are: most of them act on pixels of their own.
 LEFT_OUT_OF_VERSION = 0.0015
 #: No more is left out of a version than this of itself, however dark it is: a stroke changes few pixels.
@@ -39,7 +40,7 @@ _LOOKED_AT = 8_192, 4_096
 _TILES_LOOKED_AT = 16
 #: Entries of uncompressed rows that are multiplied in one step of a refinement: some hundredths of a second.
 _ENTRIES_AT_ONCE = 5_000_000
-#: Versions that are transformed at once.
+#: Versions that are transformed, or whose terms are marked, at once.
 _TOGETHER = 8
 
 _NONE: F32 = np.zeros((1, 0), np.float32)
@@ -72,7 +73,11 @@ class _Tiles:
         self._tiles: PairedTiles = join_tiles(parts)
         # Also of what is narrower, so that nothing that was there before stays.
         self._is_empty: Bool = np.diff(self._tiles.tile_begin) == 0 if narrow_of is None else narrow_of._is_empty
-        self._columns: TermColumns | None = None  # made for the first versions of few cells
+        self._columns: TermColumns | None = None
+
+    def order(self, n_leaves: int) -> None:
+        """Have terms found by their coefficients from now on, in `multiply` with `has_few`."""
+        self._columns = order_terms(self._tiles, n_leaves)
 
     def multiply(
         self,
@@ -87,8 +92,8 @@ class _Tiles:
     ) -> None:
         """Products of pairs of tile and version, to ``out[:, place]`` (n_lobes, n, 64, 4); `least` may be empty.
 
-        No pair is there twice. Where a lobe has no coefficients, `out` stays as it is: 0. Versions with few large
-        terms (n_versions,) are done in less time, and with the same bits, if they are known.
+        No pair is there twice. Where a lobe has no coefficients, `out` stays as it is: 0. Which versions have few
+        large terms (n_versions,) matters to time alone; without it, all terms are looked at.
         """
         assert out.flags.c_contiguous  # a copy would be written to, and lost
         lobe = np.arange(self.n_lobes, dtype=np.int32)[:, None]
@@ -96,21 +101,54 @@ class _Tiles:
         is_there = ~self._is_empty[tiles]
         jobs = tiles[is_there], np.broadcast_to(version, tiles.shape)[is_there], places[is_there]
         flat = out.reshape(-1, LANES, 4)
-        if has_few is not None:
-            few = has_few[jobs[1]]
-            if few.any():
-                found, jobs = ((jobs[0][some], jobs[1][some], jobs[2][some]) for some in (few, ~few))
-                self._multiply_found(versions, size, least, *found, flat)
-        multiply_terms(*self._tiles, versions, size, least, *jobs, flat)
+        if has_few is None:
+            multiply_terms(*self._tiles, versions, size, least, *jobs, flat)
+            return
+        assert self._columns is not None
+        few = has_few[jobs[1]]
+        if few.any():
+            self._multiply_found(self._columns, versions, size, least, *(part[few] for part in jobs), flat)
+            jobs = jobs[0][~few], jobs[1][~few], jobs[2][~few]
+        # A few versions at a time, since each has marks of its own.
+        many = np.unique(jobs[1])
+        for first in range(0, len(many), _TOGETHER):
+            marked = many[first : first + _TOGETHER]
+            some = jobs if len(marked) == len(many) else [part[np.isin(jobs[1], marked)] for part in jobs]
+            self._multiply_marked(self._columns, versions, size, least, marked, *some, flat)
 
     def _multiply_found(
-        self, versions: F32, size: F32, least: F32, tile: I32, version: I32, place: I32, out: F32
+        self,
+        columns: TermColumns,
+        versions: F32,
+        size: F32,
+        least: F32,
+        tile: I32,
+        version: I32,
+        place: I32,
+        out: F32,
     ) -> None:
-        if self._columns is None:
-            self._columns = order_terms(self._tiles, versions.shape[1])
-        begin, found = find_of_jobs(self._columns, len(self._tiles.tile_begin) - 1, size, least, tile, version)
+        begin, found = find_of_jobs(columns, len(self._is_empty), size, least, tile, version)
         _, index, scale, _, value = self._tiles
         multiply_found(index, scale, value, versions, begin, found, version, place, out)
+
+    def _multiply_marked(
+        self,
+        columns: TermColumns,
+        versions: F32,
+        size: F32,
+        least: F32,
+        marked: I32,
+        tile: I32,
+        version: I32,
+        place: I32,
+        out: F32,
+    ) -> None:
+        begin, index, scale, _, value = self._tiles
+        marks = np.zeros((len(marked), (begin[-1] >> 1) + WORD), np.uint8)
+        for v, of_version in zip(marked, marks, strict=True):
+            mark_terms(columns.begin, columns.most, columns.worth, columns.pair, size[v], least[v], of_version)
+        row = np.searchsorted(marked, version).astype(np.int32)
+        multiply_marked(begin, index, scale, value, versions, marks, tile, version, row, place, out)
 
 
 class Products:
@@ -154,6 +192,8 @@ class Products:
             self._large_terms, self._few_terms = (
                 LargeTerms(self._packed, n) if is_large and self._packed is not None else None for n in _LOOKED_AT
             )
+            if is_large and self._tiles is not None:
+                self._tiles.order(self._n_leaves)
             self._energy = self._packed.term_energies() if is_large and self._packed is not None else None
             self._counts = self._weights_of_rows() if is_large else np.zeros((0, 0, LANES), np.float32)
             self._shown = 0.0  # sum over pixels of the squared unedited light that was multiplied last
@@ -356,7 +396,7 @@ class Products:
         self.see(looked_at, some)
         least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
         leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
-        tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out)
+        tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out, np.zeros(1, np.bool_))
         if known is not None:
             known(out, tile)
 

@@ -1,6 +1,8 @@
-"""Large terms found by coefficient, against a look at all terms of each tile."""
+"""Large terms found by coefficient, listed or marked, against a look at all terms of each tile."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numba
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 
 from icheat_usd.kernels.found_terms import find_of_jobs, multiply_found, order_terms
 from icheat_usd.kernels.large_terms import multiply_terms
+from icheat_usd.kernels.marked_terms import WORD, mark_terms, multiply_marked
 from icheat_usd.kernels.packed import PairedTiles, pair_coefficients
 
 N_COEFFICIENTS, N_VERSIONS = 400, 5
@@ -55,11 +58,28 @@ def test_terms_of_a_coefficient_lie_in_order_of_their_worth() -> None:
         assert (np.diff(columns.worth[some]) <= 0).all()
         mine = np.flatnonzero((tiles.index == k) & (tiles.worth > 0))
         expected = sorted(zip(tiles.worth[mine], tile_of[mine], mine // 2, strict=True))
-        assert sorted(zip(*(part[some] for part in columns[1:]), strict=True)) == expected
+        assert sorted(zip(*(part[some] for part in columns[2:]), strict=True)) == expected
+        assert columns.most[k] == max(tiles.worth[mine], default=0)
+
+
+def multiplied_by_marks() -> np.ndarray:
+    """All jobs by terms that are marked; (n, 64, 4)."""
+    tiles, (light, size, least), (tile, version, place) = some_tiles(), some_light(), some_jobs()
+    columns = order_terms(tiles, N_COEFFICIENTS)
+    marks = np.zeros((N_VERSIONS, len(tiles.value) + WORD), np.uint8)
+    row = N_VERSIONS - 1 - version  # marks may stand in another order than versions
+    for v in range(N_VERSIONS):
+        terms = columns.begin, columns.most, columns.worth, columns.pair
+        mark_terms(*terms, size[v], least[v], marks[N_VERSIONS - 1 - v])
+    out = np.zeros((len(tile), 64, 4), np.float32)
+    multiply_marked(
+        tiles.tile_begin, tiles.index, tiles.scale, tiles.value, light, marks, tile, version, row, place, out
+    )
+    return out
 
 
 def multiplied() -> np.ndarray:
-    """All jobs by terms that are found; (n, 64, 4)."""
+    """All jobs by terms that are listed; (n, 64, 4)."""
     tiles, (light, size, least), (tile, version, place) = some_tiles(), some_light(), some_jobs()
     columns = order_terms(tiles, N_COEFFICIENTS)
     begin, found = find_of_jobs(columns, 5, size, least, tile, version)
@@ -68,19 +88,21 @@ def multiplied() -> np.ndarray:
     return out
 
 
-def test_products_have_the_bits_of_those_that_look_at_all_terms() -> None:
+@pytest.mark.parametrize("found", [multiplied, multiplied_by_marks])
+def test_products_have_the_bits_of_those_that_look_at_all_terms(found: Callable[[], np.ndarray]) -> None:
     tiles, (light, size, least), (tile, version, place) = some_tiles(), some_light(), some_jobs()
     expected = np.zeros((len(tile), 64, 4), np.float32)
     multiply_terms(*tiles, light, size, least, tile, version, place, expected)
     assert set(version) == set(range(N_VERSIONS)) and {0, 3} <= set(tile)
     assert all(expected[place[version == v]].any() for v in range(N_VERSIONS))
-    assert np.array_equal(multiplied(), expected)
+    assert np.array_equal(found(), expected)
 
 
+@pytest.mark.parametrize("found", [multiplied, multiplied_by_marks])
 @pytest.mark.parametrize("threads", [1, 2])
-def test_the_bits_do_not_depend_on_the_number_of_threads(threads: int) -> None:
-    expected = multiplied()
+def test_the_bits_do_not_depend_on_the_number_of_threads(threads: int, found: Callable[[], np.ndarray]) -> None:
+    expected = found()
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    found = multiplied()
+    again = found()
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    assert np.array_equal(found, expected)
+    assert np.array_equal(again, expected)
