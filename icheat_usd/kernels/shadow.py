@@ -8,8 +8,10 @@ distance and cosines of a single point would have.
 While a light moves little by little, most places see what they saw. Every place keeps what its last ray met. A
 frame sends the rays of a part of each run of places, another part each time; where these meet what they met
 before, the others keep what they know, and where one does not, all of the run are sent. Where points of the light
-itself came behind a surface or out of it, as on a light that is pushed into a wall, that is so for places everywhere:
-rays to such points, of which the caller knows from few places, are sent always, and say nothing of the rest of a run.
+itself came behind a surface or out of it, as on a light that is pushed into a wall, that is so for places everywhere,
+and few places tell. One that came behind is taken to be hidden from all others, too, and one that came out to be seen
+as the other points are where these all look alike; the part of rays that is sent finds where that is wrong. Between
+points that look different, rays to such ones are sent always, and say nothing of the rest of a run.
 
 .. [1] Talbot, Cline, Egbert 2005, Importance Resampling for Global Illumination.
 """
@@ -31,6 +33,10 @@ PLACE, TINT, GLOSS = 9, 3, 12  #: columns of the tables of places
 PART = 8  #: one of so many places of a run sends a ray where all have met the same so far, and that is enough
 _MIXED_PART = 4  # the same of other runs, and of those that nothing is known of
 STATES = 4  #: a place knows STATES * point + state
+#: What is told of a point of the light: of places that see it, now or before, some met something else, or nearly all
+#: see it now and did not before; hardly any place sees it.
+TURNED, APPEARED, BURIED = 1, 2, 4
+_LEAST_ALIKE = RUN // 8  # places of a run that tell how a point that came out looks to the others
 _RUNS = 16  # of a task, whose rays fill packets together
 _INVALID = np.uint32(0xFFFFFFFF)
 _STOP_SHORT = np.float32(1.0 - 1e-4)  # as for other shadow rays: lights may lie in the plane of a ceiling
@@ -106,24 +112,54 @@ def _trace(
 
 
 @kernel
-def _ask(
-    chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, turned: np.ndarray, state: np.ndarray,
-    asks: np.ndarray,
-) -> None:  # fmt: skip
-    """Which places of a run send a ray at first, and what the others know; `chosen` is -1 where there is no point."""
+def _alike(known: np.ndarray, told: np.ndarray) -> int:
+    """How a run saw the points of which nothing is told: a state, if there was one alone, else -1; -2: too few tell."""
+    met, n = 0, 0
     # Loops without branches, which the compiler turns into vectors.
-    if phase >= 0:
-        met = 0
+    if len(told) > 0:
+        for j in range(len(known)):
+            counts = 1 if known[j] >= 0 and told[max(known[j] >> 2, 0)] == 0 else 0
+            met |= counts << (known[j] & 3)
+            n += counts
+    else:
         for j in range(len(known)):
             met |= 1 << (known[j] & 3) if known[j] >= 0 else 0
-        part = (PART if met & (met - 1) == 0 else _MIXED_PART) - 1
+        n = len(known)
+    if met & (met - 1) != 0:
+        return -1
+    if n < _LEAST_ALIKE or met == 0:
+        return -2
+    return _BLOCKED if met == 1 << _BLOCKED else _CLEAR if met == 1 << _CLEAR else _THROUGH
+
+
+@kernel
+def _foretold(point: int, told: np.ndarray, alike: int) -> int:
+    """State of a point that has turned, as far as others tell; -1: they do not."""
+    if told[point] & BURIED != 0:
+        return _BLOCKED
+    return max(alike, -1) if told[point] & APPEARED != 0 else -1
+
+
+@kernel
+def _ask(
+    chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray, told: np.ndarray, alike: int,
+    state: np.ndarray, asks: np.ndarray,
+) -> None:  # fmt: skip
+    """Which places of a run send a ray at first, and what the others know; `chosen` is -1 where there is no point."""
+    if phase >= 0:
+        part = (_MIXED_PART if alike == -1 else PART) - 1
         for j in range(len(known)):
             same = known[j] >> 2 == chosen[j]
             state[j] = known[j] & 3 if same and chosen[j] >= 0 else _BLOCKED
             asks[j] = 1 if chosen[j] >= 0 and (not same or (j ^ phase) & part == 0) else 0
-        if len(turned) > 0:
+        if len(told) > 0:
             for j in range(len(known)):
-                asks[j] |= turned[chosen[j]] if chosen[j] >= 0 else 0
+                if chosen[j] >= 0 and told[chosen[j]] & TURNED != 0:
+                    foretold = _foretold(chosen[j], told, alike)
+                    state[j] = max(foretold, _BLOCKED)
+                    asks[j] |= foretold < 0
+                elif chosen[j] >= 0 and told[chosen[j]] & BURIED != 0:
+                    asks[j] |= state[j] != _BLOCKED
         for j in range(len(known), RUN):
             state[j], asks[j] = _BLOCKED, 0
     else:
@@ -135,16 +171,19 @@ def _ask(
 @kernel
 def _agree(
     rows: np.ndarray, offset: int, chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
-    turned: np.ndarray, state: np.ndarray,
+    told: np.ndarray, alike: int, state: np.ndarray,
 ) -> bool:  # fmt: skip
     """Whether the rays of a run, those of `rows` less `offset`, allow that its other places send none."""
     if phase >= 0:
-        alike = True
+        agree = True
         for q in range(len(rows)):
             j = rows[q] - offset
-            expected = len(turned) > 0 and turned[chosen[j]] != 0
-            alike &= expected or known[j] >> 2 != chosen[j] or known[j] & 3 == state[j]
-        return alike
+            if len(told) > 0 and told[chosen[j]] & TURNED != 0:
+                foretold = _foretold(chosen[j], told, alike)
+                agree &= foretold < 0 or foretold == state[j]
+            elif len(told) == 0 or told[chosen[j]] & BURIED == 0:
+                agree &= known[j] >> 2 != chosen[j] or known[j] & 3 == state[j]
+        return agree
     if not share_rays:
         return True
     common = state[rows[0] - offset] if len(rows) >= RUN // 8 else _THROUGH
@@ -169,16 +208,17 @@ def _append_rows(asks: np.ndarray, offset: int, count: int, rows: np.ndarray) ->
 def _meet(
     function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, runs: np.ndarray,
     found: np.ndarray, rays: np.ndarray, valid: np.ndarray, chosen: np.ndarray, share_rays: bool, phase: int,
-    known: np.ndarray, turned: np.ndarray, state: np.ndarray,
+    known: np.ndarray, told: np.ndarray, state: np.ndarray,
 ) -> None:  # fmt: skip
     """Find what is between the places of some runs and their points, `chosen` (n_runs, RUN)."""
     n = len(runs)
     asks, begin = np.empty((n, RUN), np.int32), np.zeros(n + 1, np.int64)
     rows, others = np.empty(n * RUN + 1, np.int32), np.empty(n * RUN + 1, np.int32)
-    every_state = state.reshape(-1)
+    every_state, alike = state.reshape(-1), np.empty(n, np.int64)
     for k in range(n):
         knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
-        _ask(chosen[k], share_rays, phase, knows, turned, state[k], asks[k])
+        alike[k] = _alike(knows, told)
+        _ask(chosen[k], share_rays, phase, knows, told, alike[k], state[k], asks[k])
         begin[k + 1] = _append_rows(asks[k], k * RUN, begin[k], rows)
     _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, rows, begin[n], every_state)
     count = 0
@@ -186,7 +226,7 @@ def _meet(
         offset = k * RUN
         some = rows[begin[k] : begin[k + 1]]
         knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
-        if not _agree(some, offset, chosen[k], share_rays, phase, knows, turned, state[k]):
+        if not _agree(some, offset, chosen[k], share_rays, phase, knows, told, alike[k], state[k]):
             for j in range(RUN):
                 asks[k, j] = 1 if chosen[k, j] >= 0 and asks[k, j] == 0 else 0
             count = _append_rows(asks[k], offset, count, others)
@@ -194,30 +234,39 @@ def _meet(
 
 
 @kernel
-def count_turned(
-    before: np.ndarray, known: np.ndarray, phase: int, share: float, least: int, turned: np.ndarray
+def tell_points(
+    before: np.ndarray, known: np.ndarray, sent: np.ndarray, some: float, all_but: float, least: int, told: np.ndarray
 ) -> None:
-    """Find points of a light whose rays mostly meet something else than in the look before.
+    """Find points of a light whose rays meet something else than in the look before, and those that are hardly seen.
 
     Parameters
     ----------
     before, known : (n,) int16
         What each place has found in the look before and in this one, as for `light_places`.
-    phase : int
-        Of the places that sent a ray, whatever others saw.
-    share, least
-        Of the places that see a point now or did before so many, and so many of them, must have met something else.
-    turned : (n_points,) int32, set
-        1 for such points.
+    sent : (n_sent,) int64
+        Places that sent a ray, whatever others saw.
+    some, all_but, least
+        Of the places that see a point now or did before so large a share, and so many of them, met something else; a
+        point has appeared if all do but so many. Buried is one that no ray sees now.
+    told : (n_points,) int32, set
+        Sums of `TURNED`, `APPEARED` and `BURIED`.
     """
-    looks, others = np.zeros(len(turned), np.int32), np.zeros(len(turned), np.int32)
-    for i in range(phase, len(known), PART):
-        old, new = np.int32(before[i]), np.int32(known[i])
-        if old >= 0 and new >= 0 and old >> 2 == new >> 2 and (old | new) & 3 != _BLOCKED:
-            looks[new >> 2] += 1
-            others[new >> 2] += 1 if old != new else 0
-    for point in range(len(turned)):
-        turned[point] = 1 if looks[point] >= least and others[point] > share * looks[point] else 0
+    both, others, looks, sees = np.zeros((4, len(told)), np.int32)
+    for q in range(len(sent)):
+        old, new = np.int32(before[sent[q]]), np.int32(known[sent[q]])
+        if new < 0:
+            continue
+        point = new >> 2
+        looks[point] += 1
+        sees[point] += 1 if new & 3 != _BLOCKED else 0
+        if old >= 0 and old >> 2 == point and (old | new) & 3 != _BLOCKED:
+            both[point] += 1
+            others[point] += 1 if old != new else 0
+    for point in range(len(told)):
+        turned = others[point] >= least and others[point] > some * both[point]
+        buried = looks[point] >= least and sees[point] == 0
+        appeared = turned and not buried and min(others[point], sees[point]) >= (1.0 - all_but) * both[point]
+        told[point] = (TURNED if turned else 0) + (APPEARED if appeared else 0) + (BURIED if buried else 0)
 
 
 @kernel
@@ -276,7 +325,7 @@ def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
     colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray, place: np.ndarray,
     tint: np.ndarray, gloss: np.ndarray, lobes: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
-    turned: np.ndarray, row: np.ndarray, wanted: np.ndarray, out: np.ndarray, through: np.ndarray, first: int,
+    told: np.ndarray, row: np.ndarray, wanted: np.ndarray, out: np.ndarray, through: np.ndarray, first: int,
     last: int,
 ) -> None:  # fmt: skip
     """`light_places` for those runs that are `wanted` from number `first` up to `last`."""
@@ -322,7 +371,7 @@ def _light_runs(
         chosen[k, size:] = -1
     _meet(
         function, arguments, opaque, passing, distant, place, runs[:n], found, rays, valid, chosen, share_rays, phase,
-        known, turned, state,
+        known, told, state,
     )  # fmt: skip
     for k in range(n):
         run = runs[k]
@@ -367,7 +416,7 @@ def light_places(
     share_rays: bool,
     phase: int,
     known: np.ndarray,
-    turned: np.ndarray,
+    told: np.ndarray,
     row: np.ndarray,
     wanted: np.ndarray,
     out: np.ndarray,
@@ -407,8 +456,8 @@ def light_places(
         Which part of the places sends rays where the others may keep what is `known`; -1: nothing is known.
     known : (n,) int16, changed
         What each place has found between it and its point; none: nobody wants to know.
-    turned : (n_points,) int32
-        1 for points whose rays meet something else than before from most places; none: that is not known.
+    told : (n_points,) int32
+        What other places tell of each point, as `tell_points` has it; none: nothing is known.
     row : (n,) int32
         Row of `out` that each place has, all different.
     wanted : (n_wanted,) int32
@@ -427,6 +476,6 @@ def light_places(
         task = 2 * turn_of if turn_of < half else 2 * (turn_of - half) + 1
         _light_runs(
             function, arguments, opaque, passing, points, first_point, colors, light, distant, seed, turn, bounds,
-            place, tint, gloss, lobes, share_rays, phase, known, turned, row, wanted, out, through, task * _RUNS,
+            place, tint, gloss, lobes, share_rays, phase, known, told, row, wanted, out, through, task * _RUNS,
             min(n_runs, (task + 1) * _RUNS),
         )  # fmt: skip

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers
-from icheat_usd.kernels.shadow import GLOSS, PART, STRIDE, count_turned, light_places
+from icheat_usd.kernels.shadow import GLOSS, PART, STRIDE, TURNED, light_places, tell_points
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.kernels.shaping import shape_places
 from icheat_usd.lighting.controls import darken, emission_frame, without
@@ -29,9 +29,11 @@ _CANDIDATES = 4  # points of the light that a place looks at
 _FEW_CANDIDATES = 2  # where places share rays
 _PIECE = 256  # runs of a look that a thread takes at a time
 _NO_POINTS = np.zeros(0, np.int32)
-# A point has turned if more than this share of the places that see it, now or before, met something else; and from how
-# many such places on that is known.
-_TURNED_SHARE, _LEAST_LOOKS = 0.5, 4
+# A point has turned if more than this share of the places that see it, now or before, met something else; what is said
+# of nearly all places may be wrong of so many; and from how many rays on either is said.
+_TURNED_SHARE, _ALL_BUT, _LEAST_LOOKS = 0.2, 0.03, 3
+_FEW_TURNED = 1 / 64  # of the points: no more are left to rays, as they cost less than to tell and to look again
+_TELLING = 8  # one of so many runs sends all rays where it is to tell the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,18 +114,23 @@ class LastLook:
     def __init__(self, places: Places) -> None:
         self.known = np.full(places.n, -1, np.int16)
         self.n = 0  #: looks so far
+        self.told: I32 = _NO_POINTS  #: by the last look, if it was one of `look_and_tell`
 
-    def turned_points(self, before: NDArray[np.int16], n_points: int) -> I32:
-        """Points of the light whose rays now mostly meet something else than in the look before: 1 each (n_points,).
+    def tell_points(self, before: NDArray[np.int16], sent: I64, n_points: int) -> I32:
+        """What this look tells of the light's points (n_points,), for looks from other places; see `kernels.shadow`.
+
+        Nothing where hardly any have turned.
 
         Parameters
         ----------
         before : (n,)
-            What `known` was then.
+            What `known` was in the look before.
+        sent : (n_sent,)
+            Places that sent a ray, whatever others saw.
         """
-        turned = np.zeros(n_points, np.int32)
-        count_turned(before, self.known, (self.n - 1) % PART, _TURNED_SHARE, _LEAST_LOOKS, turned)
-        return turned
+        told = np.zeros(n_points, np.int32)
+        tell_points(before, self.known, sent, _TURNED_SHARE, _ALL_BUT, _LEAST_LOOKS, told)
+        return told if np.count_nonzero(told & TURNED) > _FEW_TURNED * n_points else _NO_POINTS
 
     def forget(self, runs: I64) -> None:
         """Nothing is known of the places of some runs any more."""
@@ -241,7 +248,7 @@ class Look:
 
     Parameters
     ----------
-    snapshot, shadows, places, shining, seed, share_rays, out, turn, last, turned
+    snapshot, shadows, places, shining, seed, share_rays, out, turn, last, told
         As `direct_at` has them.
     """
 
@@ -256,7 +263,7 @@ class Look:
         out: F32,
         turn: int,
         last: LastLook | None,
-        turned: I32 | None,
+        told: I32 | None,
     ) -> None:
         self._snapshot, self._shadows, self._places, self._shining, self._out = snapshot, shadows, places, shining, out
         controls = snapshot.controls(0)
@@ -270,7 +277,7 @@ class Look:
         self._groups = shining.groups(_FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
         self._through = np.zeros(0 if shadows.passing is None else places.n, np.int32)
         self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
-        self._turned = _NO_POINTS if turned is None or not turned.any() else turned
+        self.told = _NO_POINTS if told is None else told
         if last is not None:
             self._known = last.known
             self._phase = last.n % PART if last.n else -1
@@ -281,8 +288,11 @@ class Look:
         every = np.arange(len(self._places.place), dtype=np.int32)
         return [partial(self.light, every[first : first + _PIECE]) for first in range(0, len(every), _PIECE)]
 
-    def light(self, runs: I32) -> None:
-        """Find what the places of some runs (n_runs,) reflect, but for what dims it in `finish`."""
+    def light(self, runs: I32, every_ray: bool = False) -> None:
+        """Find what the places of some runs (n_runs,) reflect, but for what dims it in `finish`.
+
+        With `every_ray`, whatever is known of them.
+        """
         shadows, places, groups = self._shadows, self._places, self._groups
         function, opaque = shadows.opaque.address_of("rtcOccluded16")
         passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
@@ -304,9 +314,9 @@ class Look:
             self._gloss,
             places.lobes,
             self._share_rays,
-            self._phase,
+            -1 if every_ray else self._phase,
             self._known,
-            self._turned,
+            self.told,
             places.row,
             runs,
             self._out,
@@ -330,6 +340,38 @@ class Look:
         darken(snapshot, 0, places.instance, out)
 
 
+def look_and_tell(
+    snapshot: SceneSnapshot,
+    shadows: Shadows,
+    places: Places,
+    seed: int,
+    out: F32,
+    last: LastLook,
+    shining: Shining,
+) -> I32:
+    """`direct_at` for places that tell others of the points of a light that moves, (n_points,).
+
+    Where points have turned in the look before, some runs send all rays, and tell the others first. Where they turn
+    for the first time, all look again, so that the next look knows what was there in this one.
+    """
+    before, n_points, every = last.known.copy(), len(shining.table), np.arange(len(places.place), dtype=np.int32)
+    look = Look(snapshot, shadows, places, shining, seed, False, out, 0, last, last.told[:0])
+    if len(last.told):
+        look.light(every[::_TELLING], every_ray=True)
+        sent = (every[::_TELLING, None].astype(np.int64) * RUN + np.arange(RUN)).ravel()
+        look.told = last.told = last.tell_points(before, sent[sent < places.n], n_points)
+        look.light(every[every % _TELLING != 0])
+    else:
+        look.light(every)
+        sent = np.arange((last.n - 1) % PART, places.n, PART)
+        look.told = last.told = last.tell_points(before, sent, n_points)
+        if len(last.told):
+            last.known[:] = before
+            look.light(every)
+    look.finish()
+    return last.told
+
+
 def direct_at(
     snapshot: SceneSnapshot,
     shadows: Shadows,
@@ -341,7 +383,7 @@ def direct_at(
     last: LastLook | None = None,
     shining: Shining | None = None,
     runs: I32 | None = None,
-    turned: I32 | None = None,
+    told: I32 | None = None,
 ) -> None:
     """Light of a one-light snapshot that places reflect, one shadow ray each, into `out` (n, 3) in the points' order.
 
@@ -359,10 +401,10 @@ def direct_at(
         What `shining_points` has for the snapshot and the seed, if that is known.
     runs : (n_runs,), optional
         Runs of places that are meant, by default all; what others have in `out` means nothing then.
-    turned : (n_points,), optional
-        What `LastLook.turned_points` found at other places: their rays are sent whatever `last` knows.
+    told : (n_points,), optional
+        What `look_and_tell` found at other places, of points that `last` knows as they were before.
     """
     shining = shining or shining_points(snapshot, seed)
-    look = Look(snapshot, shadows, places, shining, seed, share_rays, out, turn, last, turned)
+    look = Look(snapshot, shadows, places, shining, seed, share_rays, out, turn, last, told)
     look.light(np.arange(len(places.place), dtype=np.int32) if runs is None else runs)
     look.finish()

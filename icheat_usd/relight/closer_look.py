@@ -42,7 +42,7 @@ class CloserLook:
         seed: int,
         shining: Shining,
         direct: F32,
-        turned: I32 | None = None,
+        told: I32 | None = None,
     ) -> None:
         """Make the light of noisy cells that of their patch points.
 
@@ -52,7 +52,7 @@ class CloserLook:
             As `direct_at` has them.
         direct : (n_cells, 3), changed
             From one look at each cell.
-        turned
+        told
             As `direct_at` has it.
         """
         light, runs = self._noisy_runs(direct)
@@ -63,7 +63,7 @@ class CloserLook:
         if not len(runs):
             return
         take_back()
-        direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs, turned)
+        direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs, told)
         self._take(runs, direct)
         take_back()
         worst = self._worst_runs(direct, light, runs)

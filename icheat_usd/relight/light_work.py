@@ -30,6 +30,7 @@ from icheat_usd.lighting.quick import (
     Shining,
     build_shadows,
     direct_at,
+    look_and_tell,
     prepare_places,
     shining_points,
 )
@@ -327,14 +328,12 @@ class MovingLight:
         assert last.cells is not None and last.patches is not None
         direct = np.empty((around.gather.n, 3), np.float32)
         shadows = around.shadows_of(self._alone)
-        before = last.cells.known.copy()
-        direct_at(self._alone, shadows, around.cells, self._seed, False, direct, 0, last.cells, self._shining)
-        turned = last.cells.turned_points(before, len(self._shining.table))
+        told = look_and_tell(self._alone, shadows, around.cells, self._seed, direct, last.cells, self._shining)
         tiles, closer = around.tiles, last.patches
-        look = Look(self._alone, shadows, tiles, self._shining, self._seed, True, view_direct, 0, last.view, turned)
+        look = Look(self._alone, shadows, tiles, self._shining, self._seed, True, view_direct, 0, last.view, told)
 
         def bounce() -> None:
-            closer.improve(self._alone, shadows, self._seed, self._shining, direct, turned)
+            closer.improve(self._alone, shadows, self._seed, self._shining, direct, told)
             around.bounce(direct, radiance, self.direct, last.next_part())
 
         beside(bounce, look.pieces())

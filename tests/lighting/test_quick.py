@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.shadow import PART, is_turned_away
+from icheat_usd.kernels.shadow import APPEARED, BURIED, PART, TURNED, is_turned_away
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
 from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
 from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
-from icheat_usd.lighting.points import light_points
-from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, prepare_places, shining_points
+from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, look_and_tell, prepare_places, shining_points
 from icheat_usd.lighting.sampler import prepare_light_sampler
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
@@ -147,39 +146,44 @@ def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
     np.testing.assert_array_equal(found, fresh)
 
 
-def test_a_light_that_is_pushed_into_a_wall_turns_those_of_its_points_that_cross_it() -> None:
-    """Some places tell which, and where others know it, rays to these points find all that has changed."""
+def test_of_a_light_that_is_pushed_into_a_wall_and_pulled_out_some_places_tell_the_others() -> None:
+    """What is told of the points that cross the wall makes up for rays, where other places see all others alike."""
     light = Light(LightKind.RECT, (3, 2, 1), (translation(-0.3, 1.0, 0) @ rotation((1, 0, 0), -90))[:3], (0.8, 0.5))
     floor = quads([[[-2, 0, 2], [0, 0, 2], [0, 0, -2], [-2, 0, -2]]])
     wall = quads([[[0, -1, -2], [0, -1, 2], [0, 3, 2], [0, 3, -2]]])
-    snapshot = make_snapshot([Mesh(floor, Material(0.5)), Mesh(wall, Material(0.5))], lights=[light])
+    table = quads([[[-1.2, 0.5, 0.6], [-0.6, 0.5, 0.6], [-0.6, 0.5, -0.2], [-1.2, 0.5, -0.2]]])
+    meshes = [Mesh(floor, Material(0.5)), Mesh(wall, Material(0.5)), Mesh(table, Material(0.5))]
+    snapshot = make_snapshot(meshes, lights=[light])
     shadows, images = build_shadows(snapshot, tracer_of(snapshot)), LightImages(snapshot.textures)
     points = on_floor(snapshot, 8000)
-    many = prepare_places(snapshot, points, points.albedo, None)
+    order = np.lexsort((points.position[:, 0], np.floor(points.position[:, 2] * 20)))
+    many = prepare_places(snapshot, points, points.albedo, None, order)
     others = on_floor(snapshot, 40_000)
-    told = prepare_places(snapshot, others, others.albedo, None)
-    of_told, of_many, untold = LastLook(told), LastLook(many), LastLook(many)
+    some = prepare_places(snapshot, others, others.albedo, None)
+    of_some, of_many, untold = LastLook(some), LastLook(many), LastLook(many)
     found, alike, fresh = np.empty((3, 8000, 3), np.float32)
-    behind, missed, crossed = np.zeros(0, bool), 0, set[int]()
-    for step in range(6):
+    behind, wrong, missed, n_crossed = np.zeros(0, bool), [], [], 0
+    for step in (0, 1, 2, 3, 4, 5, 5, 4, 3, 2, 1):
         to_world = translation(0.04 * step, 0, 0) @ np.vstack([light.to_world, [0, 0, 0, 1]])
         alone = changed_light(images, one_light(snapshot, 0), to_world=to_world[:3])
-        table = light_points(alone, 5)[0]
-        before, was_behind, behind = of_told.known.copy(), behind, table[:, 0] > 0
-        direct_at(alone, shadows, told, 5, False, np.empty((told.n, 3), np.float32), last=of_told)
-        turned = of_told.turned_points(before, len(table))
-        direct_at(alone, shadows, many, 5, False, found, last=of_many, turned=turned)
+        shining = shining_points(alone, 5)
+        was_behind, behind = behind, shining.table[:, 0] > 0
+        told = look_and_tell(alone, shadows, some, 5, np.empty((some.n, 3), np.float32), of_some, shining)
+        direct_at(alone, shadows, many, 5, False, found, last=of_many, told=told)
         direct_at(alone, shadows, many, 5, False, alike, last=untold)
         direct_at(alone, shadows, many, 5, False, fresh)
-        if step:
-            now = set(np.flatnonzero(behind != was_behind))
-            # Some places send their rays in a later look, and find out then.
-            assert now <= set(np.flatnonzero(turned)) <= now | crossed
-            crossed |= now
-        np.testing.assert_array_equal(found, fresh)
-        missed += int((alike != fresh).any(axis=1).sum())
-    assert missed > 0  # by runs of which no ray went to a point that has crossed
-    assert len(crossed) > 20 and 0.1 < behind.mean() < 0.9
+        assert len(told) == (len(was_behind) > 0 and (behind != was_behind).any()) * len(behind)
+        if len(told):
+            np.testing.assert_array_equal(told & APPEARED != 0, was_behind & ~behind)
+            np.testing.assert_array_equal(told & BURIED != 0, behind)
+            assert (told[behind != was_behind] & TURNED).all()
+            n_crossed += np.count_nonzero(behind != was_behind)
+        wrong.append((found != fresh).any(axis=1).mean())
+        missed.append((alike != fresh).any(axis=1).mean())
+    assert (fresh == 0).all(axis=1).mean() > 0.05  # below the table
+    # Without a word, by runs of which no ray went to a point that has crossed; with it, at the border of the shadow.
+    assert max(wrong) < 0.01 and np.mean(wrong) < np.mean(missed) / 2
+    assert n_crossed > 40 and 0.1 < behind.mean() < 0.9
 
 
 @pytest.mark.parametrize("name", ["rect", "sun"])
