@@ -60,6 +60,17 @@ class VersionTables(NamedTuple):
     restrict: I64  #: (n_versions, 4) see `kernels.versions.version_deltas`
 
 
+class _Jobs(NamedTuple):
+    """Products of a tile and a version each, and where they go."""
+
+    tile: I32
+    version: I32
+    place: I32
+
+    def some(self, which: Bool) -> _Jobs:
+        return _Jobs(self.tile[which], self.version[which], self.place[which])
+
+
 class _Tiles:
     """Packed rows of all lobes as kernels read them."""
 
@@ -93,62 +104,44 @@ class _Tiles:
         """Products of pairs of tile and version, to ``out[:, place]`` (n_lobes, n, 64, 4); `least` may be empty.
 
         No pair is there twice. Where a lobe has no coefficients, `out` stays as it is: 0. Which versions have few
-        large terms (n_versions,) matters to time alone; without it, all terms are looked at.
+        large terms (n_versions,) matters to time alone; it needs `order`. Without it, all terms are looked at.
         """
         assert out.flags.c_contiguous  # a copy would be written to, and lost
         lobe = np.arange(self.n_lobes, dtype=np.int32)[:, None]
         tiles, places = tile + self.n_tiles * lobe, place.astype(np.int32) + out.shape[1] * lobe
         is_there = ~self._is_empty[tiles]
-        jobs = tiles[is_there], np.broadcast_to(version, tiles.shape)[is_there], places[is_there]
+        jobs = _Jobs(tiles[is_there], np.broadcast_to(version, tiles.shape)[is_there], places[is_there])
         flat = out.reshape(-1, LANES, 4)
         if has_few is None:
             multiply_terms(*self._tiles, versions, size, least, *jobs, flat)
             return
-        assert self._columns is not None
-        few = has_few[jobs[1]]
+        few = has_few[jobs.version]
         if few.any():
-            self._multiply_found(self._columns, versions, size, least, *(part[few] for part in jobs), flat)
-            jobs = jobs[0][~few], jobs[1][~few], jobs[2][~few]
+            self._multiply_found(versions, size, least, jobs.some(few), flat)
+            jobs = jobs.some(~few)
         # A few versions at a time, since each has marks of its own.
-        many = np.unique(jobs[1])
+        many = np.unique(jobs.version)
         for first in range(0, len(many), _TOGETHER):
             marked = many[first : first + _TOGETHER]
-            some = jobs if len(marked) == len(many) else [part[np.isin(jobs[1], marked)] for part in jobs]
-            self._multiply_marked(self._columns, versions, size, least, marked, *some, flat)
+            of_these = jobs if len(marked) == len(many) else jobs.some(np.isin(jobs.version, marked))
+            self._multiply_marked(versions, size, least, marked, of_these, flat)
 
-    def _multiply_found(
-        self,
-        columns: TermColumns,
-        versions: F32,
-        size: F32,
-        least: F32,
-        tile: I32,
-        version: I32,
-        place: I32,
-        out: F32,
-    ) -> None:
-        begin, found = find_of_jobs(columns, len(self._is_empty), size, least, tile, version)
+    def _multiply_found(self, versions: F32, size: F32, least: F32, jobs: _Jobs, out: F32) -> None:
+        assert self._columns is not None
+        begin, found = find_of_jobs(self._columns, len(self._is_empty), size, least, jobs.tile, jobs.version)
         _, index, scale, _, value = self._tiles
-        multiply_found(index, scale, value, versions, begin, found, version, place, out)
+        multiply_found(index, scale, value, versions, begin, found, jobs.version, jobs.place, out)
 
-    def _multiply_marked(
-        self,
-        columns: TermColumns,
-        versions: F32,
-        size: F32,
-        least: F32,
-        marked: I32,
-        tile: I32,
-        version: I32,
-        place: I32,
-        out: F32,
-    ) -> None:
+    def _multiply_marked(self, versions: F32, size: F32, least: F32, marked: I32, jobs: _Jobs, out: F32) -> None:
+        """`marked` are the versions of the jobs, ascending."""
+        assert self._columns is not None
         begin, index, scale, _, value = self._tiles
         marks = np.zeros((len(marked), (begin[-1] >> 1) + WORD), np.uint8)
         for v, of_version in zip(marked, marks, strict=True):
+            columns = self._columns
             mark_terms(columns.begin, columns.most, columns.worth, columns.pair, size[v], least[v], of_version)
-        row = np.searchsorted(marked, version).astype(np.int32)
-        multiply_marked(begin, index, scale, value, versions, marks, tile, version, row, place, out)
+        row = np.searchsorted(marked, jobs.version).astype(np.int32)
+        multiply_marked(begin, index, scale, value, versions, marks, jobs.tile, jobs.version, row, jobs.place, out)
 
 
 class Products:
