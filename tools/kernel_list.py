@@ -13,6 +13,7 @@ from typing import Any
 
 from icheat_usd.final_gather import GatherSettings
 from icheat_usd.kernels._signatures import UnlistedTypeError, dispatchers, encode, kernels_called
+from icheat_usd.relight import products
 from icheat_usd.resources import resource_path
 from icheat_usd.session.document import Session
 from icheat_usd.session.live import LiveSession
@@ -32,6 +33,13 @@ _STAGES = ("cornell_box", "glossy_set")
 
 
 def _live() -> None:
+    _change_a_little()
+    # As on stages that are not little.
+    products.SMALL_BYTES = 0
+    _change_a_little()
+
+
+def _change_a_little() -> None:
     for name in _STAGES:
         with LiveSession.open(_stage(name), width=_WIDTH, height=_HEIGHT, quality=_LIVE) as live:
             live.frame()
