@@ -146,14 +146,15 @@ def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
     np.testing.assert_array_equal(found, fresh)
 
 
-def test_of_a_light_that_is_pushed_into_a_wall_and_pulled_out_some_places_tell_the_others() -> None:
+@pytest.mark.parametrize("has_table", [False, True])
+def test_of_a_light_that_is_pushed_into_a_wall_and_pulled_out_some_places_tell_the_others(has_table: bool) -> None:
     """What is told of the points that cross the wall makes up for rays, where other places see all others alike."""
     light = Light(LightKind.RECT, (3, 2, 1), (translation(-0.3, 1.0, 0) @ rotation((1, 0, 0), -90))[:3], (0.8, 0.5))
     floor = quads([[[-2, 0, 2], [0, 0, 2], [0, 0, -2], [-2, 0, -2]]])
     wall = quads([[[0, -1, -2], [0, -1, 2], [0, 3, 2], [0, 3, -2]]])
     table = quads([[[-1.2, 0.5, 0.6], [-0.6, 0.5, 0.6], [-0.6, 0.5, -0.2], [-1.2, 0.5, -0.2]]])
     meshes = [Mesh(floor, Material(0.5)), Mesh(wall, Material(0.5)), Mesh(table, Material(0.5))]
-    snapshot = make_snapshot(meshes, lights=[light])
+    snapshot = make_snapshot(meshes[: 2 + has_table], lights=[light])
     shadows, images = build_shadows(snapshot, tracer_of(snapshot)), LightImages(snapshot.textures)
     points = on_floor(snapshot, 8000)
     order = np.lexsort((points.position[:, 0], np.floor(points.position[:, 2] * 20)))
@@ -180,9 +181,10 @@ def test_of_a_light_that_is_pushed_into_a_wall_and_pulled_out_some_places_tell_t
             n_crossed += np.count_nonzero(behind != was_behind)
         wrong.append((found != fresh).any(axis=1).mean())
         missed.append((alike != fresh).any(axis=1).mean())
-    assert (fresh == 0).all(axis=1).mean() > 0.05  # below the table
+    assert ((fresh == 0).all(axis=1).mean() > 0.2) == has_table  # below it, beside those whose point is behind the wall
     # Without a word, by runs of which no ray went to a point that has crossed; with it, at the border of the shadow.
-    assert max(wrong) < 0.01 and np.mean(wrong) < np.mean(missed) / 2
+    assert np.mean(missed) > 0.005
+    assert max(wrong) < 0.01 and np.mean(wrong) < np.mean(missed) / 2 if has_table else max(wrong) == 0
     assert n_crossed > 40 and 0.1 < behind.mean() < 0.9
 
 
