@@ -114,7 +114,7 @@ class LastLook:
     def __init__(self, places: Places) -> None:
         self.known = np.full(places.n, -1, np.int16)
         self.n = 0  #: looks so far
-        self.told: I32 = _NO_POINTS  #: by the last look, if it was one of `look_and_tell`
+        self.told: I32 = _NO_POINTS  #: by the last `look_and_tell`
 
     def tell_points(self, before: NDArray[np.int16], sent: I64, n_points: int) -> I32:
         """What this look tells of the light's points (n_points,), for looks from other places; see `kernels.shadow`.
@@ -277,7 +277,7 @@ class Look:
         self._groups = shining.groups(_FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
         self._through = np.zeros(0 if shadows.passing is None else places.n, np.int32)
         self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
-        self.told = _NO_POINTS if told is None else told
+        self.told = _NO_POINTS if told is None else told  #: of the light's points, for what is looked at from now on
         if last is not None:
             self._known = last.known
             self._phase = last.n % PART if last.n else -1
@@ -349,13 +349,18 @@ def look_and_tell(
     last: LastLook,
     shining: Shining,
 ) -> I32:
-    """`direct_at` for places that tell others of the points of a light that moves, (n_points,).
+    """`direct_at` for places that tell others of the points of a light that moves.
 
     Where points have turned in the look before, some runs send all rays, and tell the others first. Where they turn
     for the first time, all look again, so that the next look knows what was there in this one.
+
+    Returns
+    -------
+    (n_points,) int32
+        See `kernels.shadow.tell_points`; empty where hardly any point has turned.
     """
     before, n_points, every = last.known.copy(), len(shining.table), np.arange(len(places.place), dtype=np.int32)
-    look = Look(snapshot, shadows, places, shining, seed, False, out, 0, last, last.told[:0])
+    look = Look(snapshot, shadows, places, shining, seed, False, out, 0, last, None)
     if len(last.told):
         look.light(every[::_TELLING], every_ray=True)
         sent = (every[::_TELLING, None].astype(np.int64) * RUN + np.arange(RUN)).ravel()

@@ -134,11 +134,10 @@ class _Tiles:
 
     def _multiply_marked(self, versions: F32, size: F32, least: F32, marked: I32, jobs: _Jobs, out: F32) -> None:
         """`marked` are the versions of the jobs, ascending."""
-        assert self._columns is not None
-        begin, index, scale, _, value = self._tiles
+        columns, (begin, index, scale, _, value) = self._columns, self._tiles
+        assert columns is not None
         marks = np.zeros((len(marked), (begin[-1] >> 1) + WORD), np.uint8)
         for v, of_version in zip(marked, marks, strict=True):
-            columns = self._columns
             mark_terms(columns.begin, columns.most, columns.worth, columns.pair, size[v], least[v], of_version)
         row = np.searchsorted(marked, jobs.version).astype(np.int32)
         multiply_marked(begin, index, scale, value, versions, marks, jobs.tile, jobs.version, row, jobs.place, out)
