@@ -90,6 +90,7 @@ def at_least_0(text: str) -> int:
 
 
 def command(options: argparse.Namespace) -> int:
+    from icheat_usd.cli.memory import keep_freed_memory
     from icheat_usd.cli.sequence import render_frames
     from icheat_usd.errors import SettingsError
     from icheat_usd.session.quality import FINAL, PREVIEW, QUICK, QUICK_CELLS
@@ -117,4 +118,5 @@ def command(options: argparse.Namespace) -> int:
     settings = replace(start, seed=options.seed, **chosen)
     if options.noise is not None:
         settings = replace(settings, cache=replace(settings.cache, noise=options.noise))
+    keep_freed_memory()
     return render_frames(options, settings, quality)

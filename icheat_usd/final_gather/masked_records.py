@@ -6,7 +6,7 @@ for the masks at its own place, with its derivatives by them, and again where pl
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,19 +18,23 @@ from icheat_usd.edits.selection import BoundSelection
 from icheat_usd.final_gather.gatherer import Gatherer
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, Lookup
-from icheat_usd.final_gather.merged_light import merged_light, painted_weights, sent_by_group
+from icheat_usd.final_gather.merged_light import groups_of, merged_light, painted_weights, sent_by_group
 from icheat_usd.final_gather.painted_light import bits, is_painted, light_by_masks, with_few
 from icheat_usd.final_gather.receiver_sets import Touched
 from icheat_usd.final_gather.slot_choices import Slots, in_turn, slot_choices
-from icheat_usd.kernels import painted_sums, stack_sums
+from icheat_usd.kernels import merged_stack, painted_sums, stack_sums
 from icheat_usd.kernels import record_slots as kernels
 from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.kernels.record_lanes import LANES, frames_of
 from icheat_usd.scene import F32, I64, Bool, SurfacePoints
 
 
+#: Bands of an image ask for about as many slots each: so much more room is made for those of the first.
+_GROWTH = 4
+
+
 class _Values(NamedTuple):
-    """Changes of records' light for the masks of slots."""
+    """Changes of records' light for the masks of slots; rows behind these are zero."""
 
     light: F32  #: (n, LANES)
     derivative: F32  #: (n_derivatives, LANES)
@@ -67,7 +71,7 @@ class MaskedRecords:
         self._frames = np.empty((cache.n, LANES), np.float32)
         frames_of(cache.table.position, cache.table.normal, hemispheres.shrink, self._frames)
         nothing = np.empty((0, LANES), np.float32)
-        self._values = _Values(nothing, nothing)
+        self._values, self._n = _Values(nothing, nothing), 0
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
         """Change of irradiance at m receivers with records.
@@ -117,24 +121,28 @@ class MaskedRecords:
         nowhere = np.full((1, self._field.n_rows), -1, np.int16)
         begin = np.searchsorted(row, np.arange(rays.n + 1))
         slots = stack_sums.SlotTable(begin, masks, np.zeros(n, np.int32), nowhere, np.zeros(n + 1, np.int64))
-        return np.ascontiguousarray(self._evaluate(rays, row, slots).light[:, 0:15:5])
+        values = np.zeros((n, LANES), np.float32)
+        self._evaluate(rays, row, slots, values, np.zeros((0, LANES), np.float32))
+        return np.ascontiguousarray(values[:, 0:15:5])
 
     def _know(self, upto: Slots) -> None:
         """See to it that the light of some slots is known."""
-        n = len(self._values.light)
+        n = self._n
         if n == len(upto.record):
             return
         record, derived = upto.record[n:], upto.derived[n:] - upto.derived[n]
         begin = np.searchsorted(record, np.arange(self._cache.n + 1))
         places = self._choices.patterns.places()
         table = stack_sums.SlotTable(begin, upto.masks[n:], upto.pattern[n:], places, derived)
-        found = self._evaluate(self._hemispheres, record, table)
-        self._values = _Values(*(np.concatenate(pair) for pair in zip(self._values, found, strict=True)))
+        known = (n, int(upto.derived[n]))
+        self._values = _Values(*(_with_room(*one) for one in zip(self._values, known, (len(record), derived[-1]))))
+        self._evaluate(self._hemispheres, record, table, *(own[k:] for own, k in zip(self._values, known, strict=True)))
+        self._n = len(upto.record)
 
-    def _evaluate(self, of: Hemispheres, record: I64, slots: stack_sums.SlotTable) -> _Values:
-        """Changes of light, (n_slots, LANES), and derivatives, (n_derivatives, LANES)."""
-        values = np.zeros((len(record), LANES), np.float32)
-        derivative = np.zeros((int(slots.derived[-1]), LANES), np.float32)
+    def _evaluate(
+        self, of: Hemispheres, record: I64, slots: stack_sums.SlotTable, values: F32, derivative: F32
+    ) -> None:
+        """Add changes of light, (n_slots, LANES), and derivatives, (n_derivatives, LANES)."""
         wanted = np.diff(slots.begin) > 0
         # Rays of all are looked through once; other bands of the image will ask for the rest.
         likely = self._choices.likely() if of is self._hemispheres else wanted
@@ -153,22 +161,56 @@ class MaskedRecords:
                 derivative,
             )
         if self._others.any():
+            edits = (self._casters, self._weights.of_entries.column, self._casters.weight, self._stack, slots)
+            if self._weights.of_entries.width and not of.is_kept:
+                self._at_once(of, wanted, edits, values, derivative)
+                return
             light = merged_light(of, self._sent, self._others, self._weights)
             for table in light.tables(of, self._snapshot, wanted, likely):
                 stack_sums.stack_of_casters(
                     table.begin,
                     table.entry,
                     *table.rows,
-                    self._casters,
-                    self._weights.of_entries.column,
-                    self._casters.weight,
-                    self._stack,
-                    slots,
+                    *edits,
                     in_turn(np.flatnonzero(wanted & table.has)),
                     values,
                     derivative,
                 )
-        return _Values(values, derivative)
+
+    def _at_once(self, of: Hemispheres, wanted: Bool, edits: tuple[Any, ...], values: F32, derivative: F32) -> None:
+        """What other casters than those of few masks bring, where nothing of it is kept."""
+        geometry, share = self._snapshot.geometry, of.shares()
+        for rays, table, order, first, record in groups_of(of, wanted):
+            merged_stack.stack_of_rays(
+                table,
+                geometry.face,
+                geometry.face_uv,
+                self._sent,
+                order,
+                first,
+                record,
+                share,
+                self._others.view(np.uint8),
+                self._weights.of_entries.sheets,
+                self._weights.patches,
+                self._weights.plateaus,
+                self._weights.of_entries.width,
+                rays.seed,
+                rays.n_theta,
+                rays.n_phi,
+                *edits,
+                values,
+                derivative,
+            )
+
+
+def _with_room(values: F32, known: int, more: int) -> F32:
+    """Lanes with room for `more` behind those that are known: zeros, of which those that are not used cost nothing."""
+    if known + more <= len(values):
+        return values
+    wide = np.zeros((_GROWTH * (known + int(more)), LANES), np.float32)
+    wide[:known] = values[:known]
+    return wide
 
 
 def _acting(field: EditField) -> list[BoundSelection]:

@@ -79,6 +79,28 @@ def merged_light(of: Hemispheres, sent: F32, selected: Bool, weights: PaintedWei
     return found
 
 
+class Groups(NamedTuple):
+    """Hemispheres ``order[first[k]:first[k + 1]]`` of each of some records."""
+
+    rays: RecordRays
+    table: RayTable  #: the same rays
+    order: I64
+    first: I64
+    record: I64
+
+
+def groups_of(of: Hemispheres, wanted: Bool) -> Iterator[Groups]:
+    """Hemispheres of the `wanted` (n,) records, some after others: those that were traced together."""
+    for rays, owner, table in of.tables():
+        order = np.flatnonzero(wanted[owner])
+        if len(order) == 0:
+            continue
+        order = order[np.argsort(owner[order], kind="stable")]
+        mine = owner[order]
+        first = np.append(np.flatnonzero(np.append(True, mine[1:] != mine[:-1])), len(mine))
+        yield Groups(rays, table, order, first, mine[first[:-1]])
+
+
 class LightTable(NamedTuple):
     """Light of some of n records: rays of theirs taken together."""
 
@@ -181,16 +203,8 @@ class MergedLight:
         """What hemispheres of some records bring; `n_rays` is how many these have."""
         share, seen, n_rows = of.shares(), 0, 0
         rows, records = self._no_rows(0), [np.zeros(0, np.int64)]
-        for rays, owner, table in of.tables():
-            order = np.flatnonzero(has[owner])
-            if len(order) == 0:
-                continue
-            order = order[np.argsort(owner[order], kind="stable")]
-            mine = owner[order]
-            first = np.append(np.flatnonzero(np.append(True, mine[1:] != mine[:-1])), len(mine))
-            for record, number, found, n_seen in self._merged(
-                rays, table, order, first, mine[first[:-1]], share, snapshot, scratch
-            ):
+        for some in groups_of(of, has):
+            for record, number, found, n_seen in self._merged(some, share, snapshot, scratch):
                 n, seen = int(number.sum()), seen + n_seen
                 if n_rows + n > len(rows.caster):
                     grown = self._no_rows(max(n_rows + n, int(1.1 * (n_rows + n) * n_rays / seen)))
@@ -210,21 +224,13 @@ class MergedLight:
         return _Rows(np.empty(n, np.int32), np.empty((n, self._width), np.float32), np.empty(shape, np.float32))
 
     def _merged(
-        self,
-        rays: RecordRays,
-        table: RayTable,
-        order: I64,
-        first: I64,
-        record: I64,
-        share: F32,
-        snapshot: SceneSnapshot,
-        scratch: dict[int, F32],
+        self, groups: Groups, share: F32, snapshot: SceneSnapshot, scratch: dict[int, F32]
     ) -> Iterator[tuple[I64, I64, _Rows, int]]:
-        """What hemispheres ``order[first[k]:first[k + 1]]`` of each record bring, for some records after others.
+        """What hemispheres of each record bring, for some records after others.
 
         Records, how many rows each has, these rows, and how many rays there were.
         """
-        geometry = snapshot.geometry
+        geometry, (rays, table, order, first, record) = snapshot.geometry, groups
         room = rays.n_rays * int(np.diff(first).max())
         if self._width == 0:
             room = min(room, int(self._selected.sum()))

@@ -72,7 +72,7 @@ def merge_rays(  # type: ignore[no-untyped-def]
     light : (n_groups, room, n_blocks, LANES) float32, out
     """
     for g in prange(len(record)):
-        number[g] = _merge(
+        number[g] = merge_record(
             order,
             group[g],
             group[g + 1],
@@ -110,7 +110,7 @@ def _keep(g, first, end, caster, weights, light, kept_caster, kept_weights, kept
 
 
 @kernel
-def _merge(  # type: ignore[no-untyped-def]
+def merge_record(  # type: ignore[no-untyped-def]
     order,
     first,
     end,
@@ -130,6 +130,7 @@ def _merge(  # type: ignore[no-untyped-def]
     weights,
     light,
 ):
+    """`merge_rays` of one record: how many are left of the rays of hemispheres ``order[first:end]``."""
     room = rays.cell.shape[1] * (end - first)
     n, n_seen = _take_together(
         order,

@@ -32,6 +32,7 @@ from icheat_usd.kernels.simd import (
 
 #: New slots of one record from one call, beyond which places take the nearest.
 MOST_SLOTS = 32
+_CHUNK = 256  # places
 
 
 @kernel
@@ -157,11 +158,12 @@ def served_by_own(  # type: ignore[no-untyped-def]
     is_used : (n_records,) uint8, out
         Set to 1 for records that a pair is served by.
     """
-    for q in prange(len(where)):
+    for chunk in prange((len(where) + _CHUNK - 1) // _CHUNK):
         _serve(
-            where[q],
-            which[q],
-            first[q],
+            chunk * _CHUNK,
+            where,
+            which,
+            first,
             count,
             record,
             masks,
@@ -178,8 +180,9 @@ def served_by_own(  # type: ignore[no-untyped-def]
 
 @kernel
 def _serve(  # type: ignore[no-untyped-def]
-    p,
-    column,
+    begin,
+    where,
+    which,
     first,
     count,
     record,
@@ -194,14 +197,16 @@ def _serve(  # type: ignore[no-untyped-def]
     is_used,
 ):
     sums = np.empty(8, np.float32)
-    for k in range(count[p]):
-        r = record[p, k]
-        slot[first + k] = -2
-        if own_pattern[r] == pattern[column]:
-            change, bent = _difference(masks, column, own_masks, r, bend, sums)
-            if change <= most_change and bent <= most_bend:
-                slot[first + k] = -1
-                is_used[r] = 1
+    for q in range(begin, min(begin + _CHUNK, len(where))):
+        p, column = where[q], which[q]
+        for k in range(count[p]):
+            r = record[p, k]
+            slot[first[q] + k] = -2
+            if own_pattern[r] == pattern[column]:
+                change, bent = _difference(masks, column, own_masks, r, bend, sums)
+                if change <= most_change and bent <= most_bend:
+                    slot[first[q] + k] = -1
+                    is_used[r] = 1
 
 
 @parallel_kernel

@@ -191,9 +191,11 @@ def stack_of_casters(  # type: ignore[no-untyped-def]
     values : (n_slots, LANES), derivative : (n_derivatives, LANES) float32, out, added to
     """
     for g in prange(len(records)):
-        _of_casters(
-            records[g],
-            begin,
+        r = records[g]
+        stack_of_record(
+            r,
+            begin[r],
+            begin[r + 1],
             entry,
             caster,
             weights,
@@ -209,9 +211,10 @@ def stack_of_casters(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _of_casters(  # type: ignore[no-untyped-def]
-    r, begin, entry, caster, weights, light, casters, column, factor, stack, slots, values, derivative
+def stack_of_record(  # type: ignore[no-untyped-def]
+    r, begin, end_of_entries, entry, caster, weights, light, casters, column, factor, stack, slots, values, derivative
 ):
+    """`stack_of_casters` of record `r` alone, whose entries are ``entry[begin:end_of_entries]``."""
     first, end = slots.begin[r], slots.begin[r + 1]
     n_rows, n_blocks = stack.slope.shape[0], stack.slope.shape[1]
     lines = _no_lines(end - first, stack)
@@ -223,7 +226,7 @@ def _of_casters(  # type: ignore[no-untyped-def]
     shifts = _has_shifts(stack)
     light_0, values_0, start_0 = address_of(light), address_of(values), address_of(stack.start)
     derivative_0 = address_of(derivative)
-    for place_of_e in range(begin[r], begin[r + 1]):
+    for place_of_e in range(begin, end_of_entries):
         e = entry[place_of_e]
         i = np.int64(caster[e])
         held = i % _HELD

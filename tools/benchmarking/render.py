@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 
+from icheat_usd.cli.memory import keep_freed_memory
 from tools.benchmarking.runner import ROOT, Benchmark, add_common_arguments, run_benchmark, work
 
 BENCHMARK = Benchmark(
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """The whole benchmark, or one case of it in a worker."""
     if arguments.worker:
+        keep_freed_memory()  # as `icheat render` does; Mitsuba has an allocator of its own
         return work(BENCHMARK, json.loads(arguments.worker))
     unknown = _unknown(arguments)
     if unknown:
