@@ -28,7 +28,6 @@ from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.kernels.record_lanes import LANES, frames_of
 from icheat_usd.scene import F32, I64, Bool, SurfacePoints
 
-
 #: Bands of an image ask for about as many slots each: so much more room is made for those of the first.
 _GROWTH = 4
 
@@ -134,10 +133,11 @@ class MaskedRecords:
         begin = np.searchsorted(record, np.arange(self._cache.n + 1))
         places = self._choices.patterns.places()
         table = stack_sums.SlotTable(begin, upto.masks[n:], upto.pattern[n:], places, derived)
-        known = (n, int(upto.derived[n]))
-        self._values = _Values(*(_with_room(*one) for one in zip(self._values, known, (len(record), derived[-1]))))
-        self._evaluate(self._hemispheres, record, table, *(own[k:] for own, k in zip(self._values, known, strict=True)))
-        self._n = len(upto.record)
+        first = int(upto.derived[n])
+        light = _with_room(self._values.light, n, len(record))
+        derivative = _with_room(self._values.derivative, first, int(derived[-1]))
+        self._values, self._n = _Values(light, derivative), len(upto.record)
+        self._evaluate(self._hemispheres, record, table, light[n:], derivative[first:])
 
     def _evaluate(
         self, of: Hemispheres, record: I64, slots: stack_sums.SlotTable, values: F32, derivative: F32
@@ -208,7 +208,7 @@ def _with_room(values: F32, known: int, more: int) -> F32:
     """Lanes with room for `more` behind those that are known: zeros, of which those that are not used cost nothing."""
     if known + more <= len(values):
         return values
-    wide = np.zeros((_GROWTH * (known + int(more)), LANES), np.float32)
+    wide = np.zeros((_GROWTH * (known + more), LANES), np.float32)
     wide[:known] = values[:known]
     return wide
 

@@ -13,7 +13,9 @@ from icheat_usd.kernels.merged_rays import merge_record
 from icheat_usd.kernels.record_lanes import LANES
 from icheat_usd.kernels.stack_sums import stack_of_record
 
-_TURNS = 64  #: more than there are threads; each has records from everywhere, and memory of its own
+#: More turns than there are threads; each has records from everywhere, and memory of its own, which only pays for
+#: several of them.
+_TURNS, _LEAST_OF_TURN = 64, 8
 
 
 @parallel_kernel
@@ -53,9 +55,11 @@ def stack_of_rays(  # type: ignore[no-untyped-def]
     casters, column, factor, stack, slots, values, derivative
         As of `stack_sums.stack_of_casters`.
     """
-    for turn in prange(_TURNS):
+    n_turns = min(_TURNS, (len(record) + _LEAST_OF_TURN - 1) // _LEAST_OF_TURN)
+    for turn in prange(n_turns):
         _stack_of_some(
             np.int64(turn),
+            n_turns,
             rays,
             face,
             face_uv,
@@ -85,6 +89,7 @@ def stack_of_rays(  # type: ignore[no-untyped-def]
 @kernel
 def _stack_of_some(  # type: ignore[no-untyped-def]
     turn,
+    n_turns,
     rays,
     face,
     face_uv,
@@ -110,13 +115,13 @@ def _stack_of_some(  # type: ignore[no-untyped-def]
     derivative,
 ):
     most = np.int64(0)
-    for g in range(turn, len(record), _TURNS):
+    for g in range(turn, len(record), n_turns):
         most = max(most, group[g + 1] - group[g])
     room = rays.cell.shape[1] * most
     entry = np.arange(room)
     caster, weights = np.empty(room, np.int32), np.empty((room, width), np.float32)
     light = np.empty((room, sent.shape[1], LANES), np.float32)
-    for g in range(turn, len(record), _TURNS):
+    for g in range(turn, len(record), n_turns):
         r = record[g]
         n = merge_record(
             order,
