@@ -6,7 +6,7 @@ for the masks at its own place, with its derivatives by them, and again where pl
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,10 +33,20 @@ _GROWTH = 4
 
 
 class _Values(NamedTuple):
-    """Changes of records' light for the masks of slots; rows behind these are zero."""
+    """Changes of records' light for the masks of slots, with room behind them for those of more."""
 
     light: F32  #: (n, LANES)
     derivative: F32  #: (n_derivatives, LANES)
+
+
+class _Edits(NamedTuple):
+    """What `stack_sums` asks of a stack."""
+
+    casters: MaskTable
+    column: I64
+    factor: F32
+    stack: stack_sums.StackTable
+    slots: stack_sums.SlotTable
 
 
 class MaskedRecords:
@@ -70,7 +80,7 @@ class MaskedRecords:
         self._frames = np.empty((cache.n, LANES), np.float32)
         frames_of(cache.table.position, cache.table.normal, hemispheres.shrink, self._frames)
         nothing = np.empty((0, LANES), np.float32)
-        self._values, self._n = _Values(nothing, nothing), 0
+        self._values, self._n_known = _Values(nothing, nothing), 0
 
     def change(self, found: Lookup, points: SurfacePoints, receivers: Touched) -> F32:
         """Change of irradiance at m receivers with records.
@@ -121,12 +131,12 @@ class MaskedRecords:
         begin = np.searchsorted(row, np.arange(rays.n + 1))
         slots = stack_sums.SlotTable(begin, masks, np.zeros(n, np.int32), nowhere, np.zeros(n + 1, np.int64))
         values = np.zeros((n, LANES), np.float32)
-        self._evaluate(rays, row, slots, values, np.zeros((0, LANES), np.float32))
+        self._evaluate(rays, slots, values, np.zeros((0, LANES), np.float32))
         return np.ascontiguousarray(values[:, 0:15:5])
 
     def _know(self, upto: Slots) -> None:
         """See to it that the light of some slots is known."""
-        n = self._n
+        n = self._n_known
         if n == len(upto.record):
             return
         record, derived = upto.record[n:], upto.derived[n:] - upto.derived[n]
@@ -136,12 +146,10 @@ class MaskedRecords:
         first = int(upto.derived[n])
         light = _with_room(self._values.light, n, len(record))
         derivative = _with_room(self._values.derivative, first, int(derived[-1]))
-        self._values, self._n = _Values(light, derivative), len(upto.record)
-        self._evaluate(self._hemispheres, record, table, light[n:], derivative[first:])
+        self._values, self._n_known = _Values(light, derivative), len(upto.record)
+        self._evaluate(self._hemispheres, table, light[n:], derivative[first:])
 
-    def _evaluate(
-        self, of: Hemispheres, record: I64, slots: stack_sums.SlotTable, values: F32, derivative: F32
-    ) -> None:
+    def _evaluate(self, of: Hemispheres, slots: stack_sums.SlotTable, values: F32, derivative: F32) -> None:
         """Add changes of light, (n_slots, LANES), and derivatives, (n_derivatives, LANES)."""
         wanted = np.diff(slots.begin) > 0
         # Rays of all are looked through once; other bands of the image will ask for the rest.
@@ -161,7 +169,7 @@ class MaskedRecords:
                 derivative,
             )
         if self._others.any():
-            edits = (self._casters, self._weights.of_entries.column, self._casters.weight, self._stack, slots)
+            edits = _Edits(self._casters, self._weights.of_entries.column, self._casters.weight, self._stack, slots)
             if self._weights.of_entries.width and not of.is_kept:
                 self._at_once(of, wanted, edits, values, derivative)
                 return
@@ -177,7 +185,7 @@ class MaskedRecords:
                     derivative,
                 )
 
-    def _at_once(self, of: Hemispheres, wanted: Bool, edits: tuple[Any, ...], values: F32, derivative: F32) -> None:
+    def _at_once(self, of: Hemispheres, wanted: Bool, edits: _Edits, values: F32, derivative: F32) -> None:
         """What other casters than those of few masks bring, where nothing of it is kept."""
         geometry, share = self._snapshot.geometry, of.shares()
         for rays, table, order, first, record in groups_of(of, wanted):

@@ -215,6 +215,7 @@ def test_rays_are_not_looked_at_again_for_a_changed_amount(edits, monkeypatch):
 
     monkeypatch.setattr("icheat_usd.kernels.painted_sums.painted_sums", refuse)
     monkeypatch.setattr("icheat_usd.kernels.merged_rays.merge_rays", refuse)
+    monkeypatch.setattr("icheat_usd.kernels.merged_stack.stack_of_rays", refuse)
     monkeypatch.setattr("icheat_usd.kernels.row_light.row_sums", refuse)
     monkeypatch.setattr("icheat_usd.final_gather.pair_tables.pair_sums", refuse)
     for changed in changed_stacks(edits)[:2]:
