@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import ctypes
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # numbers of `mallopt` in glibc's malloc.h
-_MOST_FREE = 1 << 29  # bytes that are kept for what comes next
-_MOST_SHARED = 1 << 25  # larger arrays are still given back one by one; glibc allows no more than that
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # numbers of `mallopt` in glibc's malloc.h
+_MOST_FREE = 1 << 29  # bytes at the end of the heap that are kept for what comes next
 
 
 def keep_freed_memory() -> None:
@@ -22,5 +21,5 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # musl and macOS have none, and Windows no library without a name
         return
-    mallopt(_MMAP_THRESHOLD, _MOST_SHARED)
+    mallopt(_MMAP_MAX, 0)  # mappings of their own are given back one by one
     mallopt(_TRIM_THRESHOLD, _MOST_FREE)

@@ -61,6 +61,6 @@ def _faces(mask: BoundMask) -> I64:
 
 def weights_of(table: MaskTable, sheets: EntrySheets, n_rows: int, points: SurfacePoints) -> F32:
     """Weights of points, (n, n_rows); `sheets` are those of `sheets_of_many`."""
-    out = np.zeros((len(points.instance), n_rows), np.float32)
+    out = np.empty((len(points.instance), n_rows), np.float32)
     weights_at(table, *sheets, sheets.width, points.instance, points.face, points.face_uv, out)
     return out

@@ -101,7 +101,7 @@ class CachedGather:
         own = None
         if own_rays is not None:
             some = Part(own_rays, take_points(points, alone), np.arange(len(alone)))
-            own = Hemispheres([some], np.ones(len(alone), np.float32))
+            own = Hemispheres([some], np.ones(len(alone), np.float32), self._is_kept)
         return Sampled(points, stream, seed, found, base, shiny, alone, own)
 
 

@@ -147,16 +147,16 @@ class SlotChoices:
         own_slot[slots.record[slots.is_own]] = np.flatnonzero(slots.is_own)
         own = np.flatnonzero(used.view(np.bool_) & (own_slot < 0))
         # The few others, by record.
-        pair = np.flatnonzero(slot == -2)
-        place = np.searchsorted(first, pair, side="right") - 1
-        record = found.record[where[place], pair - first[place]].astype(np.int64)
-        order = np.argsort(record, kind="stable")
-        pair, record, column = pair[order], record[order], which[place[order]]
-        numbers = np.arange(n_records + 1)
+        n_left = int((slot == -2).sum())
+        begin, pair, place = np.zeros(n_records + 1, np.int64), np.empty(n_left, np.int64), np.empty(n_left, np.int64)
+        if n_left:
+            kernels.list_left(found.number, found.record, where, first, slot, begin, pair, place)
+        number_left, column = np.diff(begin), which[place]
+        record, numbers = np.repeat(np.arange(n_records), number_left), np.arange(n_records + 1)
         known, centre = np.argsort(slots.record, kind="stable"), np.empty(len(pair), np.int64)
         kernels.choose_slots(
-            in_turn(np.unique(record)),
-            np.searchsorted(record, numbers),
+            in_turn(np.flatnonzero(number_left)),
+            begin,
             column,
             masks,
             pattern,

@@ -60,7 +60,7 @@ def weights_at(table, sheets, column, width, instance, face, face_uv, out):  # t
     instance, face : (n,) int32
         Instance -1: no surface.
     face_uv : (n, 2) float32
-    out : (n, n_rows) float32, out, zero before
+    out : (n, n_rows) float32, out
     """
     for chunk in prange((len(instance) + _CHUNK - 1) // _CHUNK):
         _weights_of_places(chunk * _CHUNK, table, sheets, column, width, instance, face, face_uv, out)
@@ -75,6 +75,7 @@ def _weights_of_places(first, table, sheets, column, width, instance, face, face
     sizes, sheet_first, sheet_width = sheets.resolution, sheets.first, sheets.width
     for p in range(first, min(first + _CHUNK, len(instance))):
         i = np.int64(instance[p])
+        out[p] = np.float32(0.0)
         if i < 0:
             continue
         own_face, s, t = np.int64(face[p]), face_uv[p, 0], face_uv[p, 1]

@@ -72,6 +72,40 @@ def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-unt
 
 
 @kernel
+def list_left(count, record, where, first, slot, begin, pair, place):  # type: ignore[no-untyped-def]
+    """Pairs of places and records that `served_by_own` has left, by record; those of one record stay in order.
+
+    Parameters
+    ----------
+    count, record, where : as of `list_pairs`
+    first : (m,) int64
+        First pair of each place.
+    slot : (n_pairs,) int64
+        -2 for pairs that are left.
+    begin : (n_records + 1,) int64, out
+        Pairs of each record.
+    pair, place : (n_left,) int64, out
+        Number of each among all pairs, and which of `where` it is of.
+    """
+    begin[:] = 0
+    for q in range(len(where)):
+        for k in range(count[where[q]]):
+            if slot[first[q] + k] == -2:
+                begin[record[where[q], k] + 1] += 1
+    for r in range(len(begin) - 1):
+        begin[r + 1] += begin[r]
+    for q in range(len(where)):
+        for k in range(count[where[q]]):
+            if slot[first[q] + k] == -2:
+                r = record[where[q], k]
+                pair[begin[r]], place[begin[r]] = first[q] + k, q
+                begin[r] += 1
+    for r in range(len(begin) - 1, 0, -1):
+        begin[r] = begin[r - 1]
+    begin[0] = 0
+
+
+@kernel
 def mark_records(count, record, where, pattern, needed):  # type: ignore[no-untyped-def]
     """Which records are asked in which patterns.
 
