@@ -96,8 +96,9 @@ def test_errors_do_not_hold_the_noise_of_the_reference() -> None:
 
 
 def test_curves_are_compared_at_equal_time() -> None:
-    def point(label: str, seconds: float, error: float) -> dict[str, object]:
-        return {"label": label, "seconds": seconds, "rel_mse": error, "rel_mse_trimmed": error / 2}
+    def point(label: str, seconds: float, error: float, noise: float = 0.0) -> dict[str, object]:
+        errors = {"rel_mse": error, "rel_mse_trimmed": error / 2, "standard_error": noise}
+        return {"label": label, "seconds": seconds, **errors}
 
     raw = [point(f"{n}", 0.1 * n, 1.0 / n) for n in (1, 4, 16, 64, 256, 1024)]
     denoised = [point(f"{n}", 0.1 * n, 0.1 / n) for n in (1, 4, 16, 64, 256, 1024)]
@@ -112,6 +113,13 @@ def test_curves_are_compared_at_equal_time() -> None:
     assert over["1"] == pytest.approx(0.005 / 0.01)
     # Between 1 s and 16 s on a straight line in the logarithms, past the point that is worse than a quicker one.
     assert over["4"] == pytest.approx(np.sqrt(0.005 * 0.001) / 0.0025)
+    # What the noise of the reference drowns is no error: ours counts as that noise, and the other's is not known.
+    drowned = [*denoised[:4], point("drowned", 25.6, 1e-9, 0.001)]
+    known = rival_summary.comparison(
+        {"mitsuba llvm + OIDN": drowned, "ours": [*ours[:1], point("low", 2.0, 1e-9, 0.001)]}
+    )
+    assert known["over_denoised"]["rel_mse"].keys() == {"1", "4"}
+    assert known["over_denoised"]["rel_mse"]["4"] == pytest.approx(0.001 / 0.0025)
 
 
 def test_goals_say_what_was_met_and_what_was_missed() -> None:

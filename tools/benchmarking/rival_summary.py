@@ -18,6 +18,9 @@ _MEASURES = {"rel_mse": "untrimmed", "rel_mse_trimmed": "trimmed"}
 #: over the denoiser's.
 _EFFICIENCY, _OTHER_EFFICIENCY, _OVER_DENOISED = {"cornell_box": 50.0}, 10.0, 0.5
 
+#: Standard errors up to which an error is no more than the noise of the reference.
+_DROWNED = 2.0
+
 #: A curve is used this much beyond its ends; ours on and on, as a picture that is there stays there.
 _SLACK = 1.1
 
@@ -39,18 +42,25 @@ def error_at(points: list[dict[str, Any]], measure: str, seconds: float, *, stay
     """Error after so many seconds, interpolated in the logarithms; None where the curve does not reach.
 
     A slower point with a larger error than a quicker one is left out: nobody would choose it. So are errors that the
-    noise of the reference drowns. With `stays` the last one holds for ever: for those whose efforts end before the
-    time that all others are given.
+    noise of the reference drowns, and all that comes after them is not known. With `stays` the last one holds for ever,
+    and what is drowned counts as one standard error: for ours, whose efforts end before the time that all others are
+    given, and which is to be better than the others.
     """
+    known = [point for point in points if stays or _is_known(point, measure)]
     times, values = [], []
-    for point in sorted(points, key=lambda point: point["seconds"]):
-        if point[measure] > 0 and (not values or point[measure] < values[-1]):
+    for point in sorted(known, key=lambda point: point["seconds"]):
+        value = max(point[measure], point["standard_error"])
+        if not values or value < values[-1]:
             times.append(point["seconds"])
-            values.append(point[measure])
-    last = np.inf if stays else max((point["seconds"] for point in points), default=0.0) * _SLACK
+            values.append(value)
+    last = np.inf if stays else max((point["seconds"] for point in known), default=0.0) * _SLACK
     if not times or not times[0] / _SLACK <= seconds <= last:
         return None
     return float(np.exp(np.interp(np.log(seconds), np.log(times), np.log(values))))
+
+
+def _is_known(point: dict[str, Any], measure: str) -> bool:
+    return bool(point[measure] > _DROWNED * point["standard_error"])
 
 
 def comparison(curves: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
@@ -63,7 +73,9 @@ def comparison(curves: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
             # Noise falls with time: the product is the same all along, and best known where it is smallest.
             product = float(np.exp(np.mean(np.log(raw[-4:]))))
             found["efficiency"][measure] = {
-                point["label"]: product / (point[measure] * point["seconds"]) for point in ours if point[measure] > 0
+                point["label"]: product / (point[measure] * point["seconds"])
+                for point in ours
+                if _is_known(point, measure)
             }
         pairs = {
             seconds: (
