@@ -37,10 +37,10 @@ def _rivals(stage: str, curves: dict[str, list[dict[str, Any]]], path: Path) -> 
     """Errors over time, both in logarithms."""
     figure, all_axes = pyplot.subplots(1, len(_MEASURES), figsize=(5 * len(_MEASURES), 4))
     for axes, (measure, label) in zip(all_axes, _MEASURES.items(), strict=True):
-        for name, points in curves.items():
+        for name, points in _lines(curves).items():
             shown = [(p["seconds"], p[measure]) for p in points if p[measure] is not None and p[measure] > 0]
             if shown:
-                axes.loglog(*zip(*shown, strict=True), "o-", label=name, markersize=3, lw=2 if name == "ours" else 1)
+                axes.loglog(*zip(*shown, strict=True), "o-", label=name, markersize=3, lw=1 + name.startswith("ours"))
         axes.set_xlabel("seconds")
         _plain_numbers(axes.xaxis)
         axes.set_title(label, fontsize=9)
@@ -48,6 +48,16 @@ def _rivals(stage: str, curves: dict[str, list[dict[str, Any]]], path: Path) -> 
     all_axes[0].legend(fontsize=7)
     figure.suptitle(stage, fontsize=10)
     _save(figure, path)
+
+
+def _lines(curves: dict[str, list[dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
+    """Curves, ours with a line for each method: a line from one to the other would mean nothing."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name, points in curves.items():
+        for point in points:
+            method = f"ours, {point['label'].split()[0]}" if name == "ours" else name
+            found.setdefault(method, []).append(point)
+    return found
 
 
 def _scale(points: list[dict[str, Any]], path: Path) -> None:
