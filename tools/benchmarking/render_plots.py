@@ -76,6 +76,7 @@ def _scale(points: list[dict[str, Any]], path: Path) -> None:
         axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
         _plain_numbers(axes.yaxis)
         axes.tick_params(labelsize=8)
+        axes.tick_params(axis="x", rotation=30)
         axes.grid(alpha=0.3)
     all_axes[0][0].legend(fontsize=7)
     _save(figure, path)
