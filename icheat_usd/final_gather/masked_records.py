@@ -213,12 +213,13 @@ class MaskedRecords:
 
 
 def _with_room(values: F32, known: int, more: int) -> F32:
-    """Lanes with room for `more` behind those that are known: zeros, of which those that are not used cost nothing."""
-    if known + more <= len(values):
-        return values
-    wide = np.zeros((_GROWTH * (known + more), LANES), np.float32)
-    wide[:known] = values[:known]
-    return wide
+    """Lanes with room for `more` behind those that are known, which are zero."""
+    if known + more > len(values):
+        known_values = values[:known]
+        values = np.empty((_GROWTH * (known + more), LANES), np.float32)
+        values[:known] = known_values
+    values[known : known + more] = 0
+    return values
 
 
 def _acting(field: EditField) -> list[BoundSelection]:
