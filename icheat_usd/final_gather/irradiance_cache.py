@@ -252,8 +252,7 @@ class IrradianceCache:
 
     def add(self, places: Places) -> None:
         """New records at all of these places."""
-        at_once = max(1, _RAYS_AT_ONCE // (self.settings.n_theta * self.settings.n_phi))
-        first = self.n
+        at_once, first = self._hemispheres_at_once(), self.n
         tables, values = [], []
         for begin in range(0, len(places.extent), at_once):
             some = np.arange(begin, min(begin + at_once, len(places.extent)))
@@ -293,22 +292,33 @@ class IrradianceCache:
         wanted = np.rint(spread[:, 2] / settings.noise * (reach / _USUAL_REACH))
         number = np.clip(wanted, 1, settings.most_hemispheres).astype(np.int64)
         closeness = 1 / spread[:, 0].astype(np.float64)
-        for further in range(1, int(number.max(initial=1))):
-            rows = np.flatnonzero(number > further)
-            some = take_points(points, rows)
-            rays = self.tracer.trace(some, record[rows] + further * _NEXT_HEMISPHERE)
+        # All that follow the first, those of one record next to each other: a call takes as long as many rays.
+        end = np.cumsum(number - 1)
+        for piece in range(-(-int(end[-1]) // self._hemispheres_at_once())):
+            rows = np.flatnonzero((number > 1) & ((end - 1) // self._hemispheres_at_once() == piece))
+            if len(rows) == 0:
+                continue
+            of_row = number[rows] - 1
+            first = np.cumsum(of_row) - of_row
+            row = np.repeat(rows, of_row)
+            which = np.arange(1, len(row) + 1) - np.repeat(first, of_row)
+            some = take_points(points, row)
+            rays = self.tracer.trace(some, record[row] + which * _NEXT_HEMISPHERE)
             more, other = self.sums(rays, rays.radiance(self.cells))
             for column, new in zip(values, more, strict=True):
-                column[rows] += new
-            closeness[rows] += 1 / other[:, 0].astype(np.float64)
-            spread[rows, 1] = np.minimum(spread[rows, 1], other[:, 1])
-            self._keep(rays, some, record[rows])
+                column[rows] += np.add.reduceat(new, first)
+            closeness[rows] += np.add.reduceat(1 / other[:, 0].astype(np.float64), first)
+            spread[rows, 1] = np.minimum(spread[rows, 1], np.minimum.reduceat(other[:, 1], first))
+            self._keep(rays, some, record[row])
         share = (1 / number).astype(np.float32)
         for column in values:
             column *= share.reshape(-1, *(1,) * (column.ndim - 1))
         with np.errstate(divide="ignore"):
             spread[:, 0] = number / closeness
         return values, spread
+
+    def _hemispheres_at_once(self) -> int:
+        return max(1, _RAYS_AT_ONCE // (self.settings.n_theta * self.settings.n_phi))
 
     def _keep(self, rays: RecordRays, points: SurfacePoints, record: I64) -> None:
         if self.is_kept:

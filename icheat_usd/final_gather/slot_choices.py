@@ -25,6 +25,8 @@ from icheat_usd.scene import F32, I32, I64, Bool
 MOST_CHANGE, MOST_BEND = 0.25, 0.01
 #: Stacks whose choices are kept for others.
 _MOST_KEPT = 4
+#: Share of pairs that own slots of records may leave, so that all records that are likely to be asked get one.
+_FEW_LEFT = 0.01
 _TURNS = 64  #: more than there are threads
 
 
@@ -145,9 +147,12 @@ class SlotChoices:
         )
         own_slot = np.full(n_records, -1, np.int64)
         own_slot[slots.record[slots.is_own]] = np.flatnonzero(slots.is_own)
+        n_left = int((slot == -2).sum())
+        if len(slots.record) == 0 and n_left < _FEW_LEFT * len(slot):
+            # Other bands of the image will ask for the rest: rays of all are looked through once.
+            used |= self.likely().view(np.uint8)
         own = np.flatnonzero(used.view(np.bool_) & (own_slot < 0))
         # The few others, by record.
-        n_left = int((slot == -2).sum())
         begin, pair, place = np.zeros(n_records + 1, np.int64), np.empty(n_left, np.int64), np.empty(n_left, np.int64)
         if n_left:
             kernels.list_left(found.number, found.record, where, first, slot, begin, pair, place)

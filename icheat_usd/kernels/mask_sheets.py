@@ -90,3 +90,11 @@ def add_weights_in_sheet(size, first, width, face, s, t, factor, texels_0, out_0
                 load_color(to),
             ),
         )
+
+
+@kernel
+def add_texel(first, width, texel, factor, texels_0, out_0):  # type: ignore[no-untyped-def]
+    """Columns of one texel of a sheet times a factor, added to those at an address."""
+    at = texels_0 + 4 * (first + texel * width)
+    for q in range(0, 4 * width, 16):
+        store_color(out_0 + q, scale_add(load_color(at + q), factor, load_color(out_0 + q)))

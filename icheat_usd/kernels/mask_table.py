@@ -33,16 +33,17 @@ class MaskTable(NamedTuple):
 @parallel_kernel
 def any_positive(weights, out):  # type: ignore[no-untyped-def]
     """Whether any of the weights (n, n_rows) of each place is above 0, (n,) uint8, out."""
-    for p in prange(len(weights)):
-        out[p] = _any_positive(np.int64(p), weights)
+    for chunk in prange((len(weights) + _CHUNK - 1) // _CHUNK):
+        _any_of_some(chunk * _CHUNK, weights, out)
 
 
 @kernel
-def _any_positive(p, weights):  # type: ignore[no-untyped-def]
-    found = False
-    for row in range(weights.shape[1]):
-        found |= weights[p, row] > np.float32(0.0)
-    return found
+def _any_of_some(begin, weights, out):  # type: ignore[no-untyped-def]
+    for p in range(begin, min(begin + _CHUNK, len(weights))):
+        found = False
+        for row in range(weights.shape[1]):
+            found |= weights[p, row] > np.float32(0.0)
+        out[p] = found
 
 
 @parallel_kernel

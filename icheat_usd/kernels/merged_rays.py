@@ -12,7 +12,7 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.caster_sums import ray_weights, room_of_weights
-from icheat_usd.kernels.mask_sheets import add_weights_in_sheet
+from icheat_usd.kernels.mask_sheets import add_texel, add_weights_in_sheet
 from icheat_usd.kernels.record_lanes import LANES, add_ray
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.simd import address_of, black, color_product, load_color, load_rgb, store_color
@@ -68,7 +68,7 @@ def merge_rays(  # type: ignore[no-untyped-def]
         How many are left of the rays of each record.
     caster : (n_groups, room) int32, out
     weights : (n_groups, room, width) float32, out
-        Mean of the sheets' columns.
+        Mean of the sheets' columns: of rays in patches as the nearest texels of the finest sheet have them.
     light : (n_groups, room, n_blocks, LANES) float32, out
     """
     for g in prange(len(record)):
@@ -216,6 +216,8 @@ def _take_together(  # type: ignore[no-untyped-def]
     first_cell, patch = patches.first, patches.patch
     share = np.float32(np.pi / n_rays * factor)
     n, n_seen, last, last_key = 0, 0, np.int64(-1), np.int64(-1)
+    last_instance, is_painted = np.int64(-1), False
+    first_sheet, sheet_end, own_first, size = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for k in range(first, end):
         r = order[k]
         ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), n_theta, n_phi, factor, ray_weight)
@@ -236,8 +238,13 @@ def _take_together(  # type: ignore[no-untyped-def]
             if i < 0 or not selected[i]:
                 continue
             n_seen += 1
-            own_key, is_painted = i, sheet_begin[i] < sheet_begin[i + 1]
-            own_face, s, t = np.int64(0), np.float32(0.0), np.float32(0.0)
+            if i != last_instance:
+                last_instance, first_sheet, sheet_end = i, sheet_begin[i], sheet_begin[i + 1]
+                own_first, is_painted = first_cell[i], first_sheet < sheet_end
+                # The finest sheet is the last.
+                size = resolution[sheet_end - 1] if is_painted else np.int64(0)
+            own_key, own_face, nearest = i, np.int64(0), np.int64(0)
+            s, t = np.float32(0.0), np.float32(0.0)
             if is_painted:
                 if is_detour:
                     own_face = np.int64(end_face[d - 1])
@@ -249,10 +256,12 @@ def _take_together(  # type: ignore[no-untyped-def]
                     u = np.float32(1.0) - v - w
                     s = u * face_uv[hit, 0, 0] + v * face_uv[hit, 1, 0] + w * face_uv[hit, 2, 0]
                     t = u * face_uv[hit, 0, 1] + v * face_uv[hit, 1, 1] + w * face_uv[hit, 2, 1]
-                # The finest sheet is the last.
-                size = resolution[sheet_begin[i + 1] - 1]
-                own_cell = first_cell[i] + own_face * size * size + corner_texels(size, s, t)[0]
-                own_key = n_instances + patch[own_cell] if patch[own_cell] >= 0 else np.int64(-1)
+                top_left, top_right, left, _, x, y = corner_texels(size, s, t)
+                first_texel = own_face * size * size
+                nearest = first_texel + (left if y > np.float32(0.5) else top_left)
+                nearest += top_right - top_left if x > np.float32(0.5) else 0
+                own_patch = patch[own_first + first_texel + top_left]
+                own_key = n_instances + own_patch if own_patch >= 0 else np.int64(-1)
             if own_key < 0 or own_key != last_key:
                 # Rays without a patch are kept apart.
                 place = _place(own_key, key) if own_key >= 0 else np.int64(-1)
@@ -279,11 +288,15 @@ def _take_together(  # type: ignore[no-untyped-def]
                         size_of_light += abs(sent[sender, block, 3])
                 bright[last] += size_of_light
                 to = mean_0 + 4 * width * last
-                for sheet in range(sheet_begin[i], sheet_begin[i + 1]):
+                for sheet in range(first_sheet, sheet_end):
                     wide = sheet_width[sheet]
-                    add_weights_in_sheet(
-                        resolution[sheet], sheet_first[sheet], wide, own_face, s, t, size_of_light, texels_0, to
-                    )
+                    if own_key >= 0 and sheet + 1 == sheet_end:
+                        # Of many rays that end in one patch the nearest texels are as good, for a quarter of the reads.
+                        add_texel(sheet_first[sheet], wide, nearest, size_of_light, texels_0, to)
+                    else:
+                        add_weights_in_sheet(
+                            resolution[sheet], sheet_first[sheet], wide, own_face, s, t, size_of_light, texels_0, to
+                        )
                     to += 4 * wide
             for block in range(n_blocks):
                 brought = load_color(sent_0 + 16 * (sender * n_blocks + block))

@@ -14,6 +14,7 @@ from icheat_usd.kernels.record_lanes import LANES
 from icheat_usd.kernels.simd import (
     address_of,
     black,
+    channel,
     color_add,
     color_product,
     difference,
@@ -24,7 +25,6 @@ from icheat_usd.kernels.simd import (
     product,
     sixteen_of,
     spread,
-    store_color,
     store_rgb,
     sum_of_fives,
     zeros,
@@ -133,7 +133,7 @@ def slots_of_pairs(count, record, where, pattern, known, first, slot):  # type: 
 
 
 @kernel
-def _difference(a, i, b, j, bend, sums):  # type: ignore[no-untyped-def]
+def _difference(a, i, b, j, bend):  # type: ignore[no-untyped-def]
     """How differently two rows of masks act: sum of relative changes, and what each two of them make together."""
     n = len(bend)
     a_0, b_0, bend_0 = address_of(a) + 4 * n * i, address_of(b) + 4 * n * j, address_of(bend)
@@ -142,10 +142,8 @@ def _difference(a, i, b, j, bend, sums):  # type: ignore[no-untyped-def]
         own = difference(load_color(a_0 + 16 * block), load_color(b_0 + 16 * block))
         own = color_product(own, load_color(bend_0 + 16 * block))
         total, squares = plus_size(total, own), color_add(own, own, squares)
-    store_color(address_of(sums), total)
-    store_color(address_of(sums) + 16, squares)
-    change = (sums[0] + sums[1]) + (sums[2] + sums[3])
-    square = (sums[4] + sums[5]) + (sums[6] + sums[7])
+    change = (channel(total, 0) + channel(total, 1)) + (channel(total, 2) + channel(total, 3))
+    square = (channel(squares, 0) + channel(squares, 1)) + (channel(squares, 2) + channel(squares, 3))
     for row in range(n - n % 4, n):
         own = abs(a[i, row] - b[j, row]) * bend[row]
         change += own
@@ -230,14 +228,13 @@ def _serve(  # type: ignore[no-untyped-def]
     slot,
     is_used,
 ):
-    sums = np.empty(8, np.float32)
     for q in range(begin, min(begin + _CHUNK, len(where))):
         p, column = where[q], which[q]
         for k in range(count[p]):
             r = record[p, k]
             slot[first[q] + k] = -2
             if own_pattern[r] == pattern[column]:
-                change, bent = _difference(masks, column, own_masks, r, bend, sums)
+                change, bent = _difference(masks, column, own_masks, r, bend)
                 if change <= most_change and bent <= most_bend:
                     slot[first[q] + k] = -1
                     is_used[r] = 1
@@ -321,7 +318,6 @@ def _choose(  # type: ignore[no-untyped-def]
     centre,
 ):
     new, n_new = np.empty(MOST_SLOTS, np.int64), 0
-    sums = np.empty(8, np.float32)
     for e in range(begin[r], begin[r + 1]):
         column = which[e]
         best, least = np.int64(e), np.float32(np.inf)
@@ -330,7 +326,7 @@ def _choose(  # type: ignore[no-untyped-def]
             s = known_slot[k]
             if slot_pattern[s] != pattern[column]:
                 continue
-            change, bent = _difference(masks, column, slot_masks, s, bend, sums)
+            change, bent = _difference(masks, column, slot_masks, s, bend)
             if change < least:
                 best, least = -1 - s, change
                 is_near = change <= most_change and bent <= most_bend
@@ -342,7 +338,7 @@ def _choose(  # type: ignore[no-untyped-def]
             q += 1
             if pattern[there] != pattern[column]:
                 continue
-            change, bent = _difference(masks, column, masks, there, bend, sums)
+            change, bent = _difference(masks, column, masks, there, bend)
             if change < least:
                 best, least = new[q - 1], change
                 is_near = change <= most_change and bent <= most_bend
@@ -357,18 +353,19 @@ def _choose(  # type: ignore[no-untyped-def]
 @parallel_kernel
 def rows_in(masks, acts, out):  # type: ignore[no-untyped-def]
     """Bits of the rows that act in columns of masks (k, n_rows), into words (k, n_words)."""
-    for k in prange(len(masks)):
-        _rows_in(np.int64(k), masks, acts, out)
+    for chunk in prange((len(masks) + _CHUNK - 1) // _CHUNK):
+        _rows_of_some(chunk * _CHUNK, masks, acts, out)
 
 
 @kernel
-def _rows_in(k, masks, acts, out):  # type: ignore[no-untyped-def]
-    for word in range(out.shape[1]):
-        found = np.uint64(0)
-        for row in range(64 * word, min(64 * word + 64, masks.shape[1])):
-            if masks[k, row] > np.float32(0.0) and acts[row]:
-                found |= np.uint64(1) << np.uint64(row & 63)
-        out[k, word] = found
+def _rows_of_some(begin, masks, acts, out):  # type: ignore[no-untyped-def]
+    for k in range(begin, min(begin + _CHUNK, len(masks))):
+        for word in range(out.shape[1]):
+            found = np.uint64(0)
+            for row in range(64 * word, min(64 * word + 64, masks.shape[1])):
+                if masks[k, row] > np.float32(0.0) and acts[row]:
+                    found |= np.uint64(1) << np.uint64(row & 63)
+            out[k, word] = found
 
 
 @parallel_kernel
@@ -390,7 +387,7 @@ def mix_slots(  # type: ignore[no-untyped-def]
     where,
     which,
     masks,
-    first,
+    first_pair,
     out,
 ):
     """`irradiance_cache.interpolate` at m of n places, of each record's light in the slot for the place.
@@ -409,10 +406,9 @@ def mix_slots(  # type: ignore[no-untyped-def]
         First pair of each place.
     out : (m, 3) float32
     """
-    for q in prange(len(where)):
-        _mix_at(
-            np.int64(q),
-            where[q],
+    for chunk in prange((len(where) + _CHUNK - 1) // _CHUNK):
+        _mix_some(
+            chunk * _CHUNK,
             frame,
             values,
             derivative,
@@ -427,17 +423,17 @@ def mix_slots(  # type: ignore[no-untyped-def]
             count,
             record,
             weight,
-            which[q],
+            where,
+            which,
             masks,
-            first[q],
+            first_pair,
             out,
         )
 
 
 @kernel
-def _mix_at(  # type: ignore[no-untyped-def]
-    q,
-    p,
+def _mix_some(  # type: ignore[no-untyped-def]
+    begin,
     frame,
     values,
     derivative,
@@ -452,34 +448,37 @@ def _mix_at(  # type: ignore[no-untyped-def]
     count,
     record,
     weight,
-    column,
+    where,
+    which,
     masks,
-    first,
+    first_pair,
     out,
 ):
-    values_0, derivative_0 = address_of(values), address_of(derivative)
-    x, y, z = position[p, 0], position[p, 1], position[p, 2]
-    nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
-    total = zeros()
-    for k in range(count[p]):
-        r, s = record[p, k], slot[first + k]
-        light = load(values_0 + 4 * LANES * s)
-        if derived[s] < derived[s + 1]:
-            pattern = slot_pattern[s]
-            by = derivative_0 + 4 * LANES * (derived[s] - soft_begin[pattern])
-            for e in range(soft_begin[pattern], soft_begin[pattern + 1]):
-                row = soft_row[e]
-                step = masks[column, row] - slot_masks[s, row]
-                light = multiply_add(spread(step), load(by + 4 * LANES * e), light)
-        dx, dy, dz = x - frame[r, 0], y - frame[r, 1], z - frame[r, 2]
-        mx, my, mz = frame[r, 3], frame[r, 4], frame[r, 5]
-        cx, cy, cz = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
-        taken = sixteen_of(
-            np.float32(1.0),
-            cx * frame[r, 6] + cy * frame[r, 7] + cz * frame[r, 8],
-            cx * frame[r, 9] + cy * frame[r, 10] + cz * frame[r, 11],
-            frame[r, 12] * (dx * frame[r, 6] + dy * frame[r, 7] + dz * frame[r, 8]),
-            frame[r, 12] * (dx * frame[r, 9] + dy * frame[r, 10] + dz * frame[r, 11]),
-        )
-        total = multiply_add(product(light, taken), spread(weight[p, k]), total)
-    store_rgb(address_of(out) + 12 * q, sum_of_fives(total))
+    values_0, derivative_0, out_0 = address_of(values), address_of(derivative), address_of(out)
+    for q in range(begin, min(begin + _CHUNK, len(where))):
+        p, column, first = where[q], which[q], first_pair[q]
+        x, y, z = position[p, 0], position[p, 1], position[p, 2]
+        nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
+        total = zeros()
+        for k in range(count[p]):
+            r, s = record[p, k], slot[first + k]
+            light = load(values_0 + 4 * LANES * s)
+            if derived[s] < derived[s + 1]:
+                pattern = slot_pattern[s]
+                by = derivative_0 + 4 * LANES * (derived[s] - soft_begin[pattern])
+                for e in range(soft_begin[pattern], soft_begin[pattern + 1]):
+                    row = soft_row[e]
+                    step = masks[column, row] - slot_masks[s, row]
+                    light = multiply_add(spread(step), load(by + 4 * LANES * e), light)
+            dx, dy, dz = x - frame[r, 0], y - frame[r, 1], z - frame[r, 2]
+            mx, my, mz = frame[r, 3], frame[r, 4], frame[r, 5]
+            cx, cy, cz = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
+            taken = sixteen_of(
+                np.float32(1.0),
+                cx * frame[r, 6] + cy * frame[r, 7] + cz * frame[r, 8],
+                cx * frame[r, 9] + cy * frame[r, 10] + cz * frame[r, 11],
+                frame[r, 12] * (dx * frame[r, 6] + dy * frame[r, 7] + dz * frame[r, 8]),
+                frame[r, 12] * (dx * frame[r, 9] + dy * frame[r, 10] + dz * frame[r, 11]),
+            )
+            total = multiply_add(product(light, taken), spread(weight[p, k]), total)
+        store_rgb(out_0 + 12 * q, sum_of_fives(total))

@@ -73,7 +73,7 @@ def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKey
     rows = gather if quality.record_error is None else training
     transport = digest("transport", rows, *_transport_settings(quality))
     packed = digest("packed", transport, training, quality.packing_error)
-    cell_light = digest("cell light", bounces, lights, quality.n_bounces, quality.light_samples)
+    cell_light = digest("cell light", bounces, lights, quality.n_bounces, quality.light_samples, quality.dome_places)
     view_light = digest("view light", sight, lights, quality.light_samples, quality.dome_samples)
     view = digest("view", sight, domes)  # the sky behind the scene is part of the view
     return ShotKeys(
@@ -93,7 +93,7 @@ def snapshot_key(snapshot: SceneSnapshot, engine: str) -> str:
 def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     """All settings but those that other keys hold, or that come after the transport."""
     elsewhere = {"n_gather", "rays_per_bounce_row", "rest_bounce_rays", "n_bounces"}
-    elsewhere |= {"light_samples", "dome_samples", "samples_per_pixel"}
+    elsewhere |= {"light_samples", "dome_samples", "dome_places", "samples_per_pixel"}
     at_records, everywhere = {"record_rays", "record_share"}, {"rays_per_row", "row_spacing", "shared_rays"}
     unused = at_records if quality.record_error is None else everywhere
     without = elsewhere | unused | {"packing_error"}

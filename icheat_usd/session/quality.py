@@ -27,6 +27,8 @@ class Quality:
     packing_error: float | None = None  #: relative RMS error that packed rows may add; None keeps them exact
     light_samples: int = 16  #: shadow rays per light and point
     dome_samples: int | None = None  #: for the direct light of domes in the image; 4 `light_samples` by default
+    #: Places that are told apart in learning where the light of domes comes from.
+    dome_places: int = 512
     n_bounces: int = 16  #: diffuse reflections before the last one
     samples_per_pixel: int = 1
     seed: int = 0
@@ -64,7 +66,7 @@ QUICK = GatherSettings(
     cache=replace(FINAL.cache, near_paths=16),
     denoise=True,
 )
-QUICK_CELLS = replace(PREVIEW, n_gather=8_192, rays_per_bounce_row=32)
+QUICK_CELLS = replace(PREVIEW, n_gather=8_192, rays_per_bounce_row=32, dome_places=256)
 
 
 def coarse(quality: Quality) -> Quality:

@@ -12,6 +12,7 @@ from typing import Any, Protocol, TypeVar, cast
 from icheat_usd.final_gather.photon_map import photon_cell_radiance
 from icheat_usd.final_gather.photons import PhotonSettings
 from icheat_usd.lighting import LightSampler, build_light_sampler
+from icheat_usd.lighting.guide import Effort
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight import Relighter
 from icheat_usd.relight.relighter import light_view
@@ -136,7 +137,9 @@ class ShotParts:
     @cached_property
     def light_sampler(self) -> LightSampler:
         """What lights of the gather samples are sampled by; it knows where around these they can be seen."""
-        return build_light_sampler(self.snapshot, self.tracer, self.gather.patch_points, self.quality.seed)
+        quality, points = self.quality, self.gather.patch_points
+        effort = Effort(leaves=quality.dome_places)
+        return build_light_sampler(self.snapshot, self.tracer, points, quality.seed, effort)
 
     @cached_property
     def training(self) -> F32:

@@ -107,6 +107,7 @@ def test_geometry_materials_and_the_tracer_are_in_every_key_but_the_lights() -> 
         ("rays_per_bounce_row", 16, {"bounces", "rest_bounces", "cell_light", "training", "packed"}),
         ("rest_bounce_rays", 64, {"rest_bounces"}),
         ("dome_samples", 3, {"view_light"}),
+        ("dome_places", 64, {"cell_light"}),
         ("n_gather", 64, {"gather", "bounces", "rest_bounces", "training", "transport", "packed", "cell_light"}),
         ("seed", 1, ALL - {"scene", "lights"}),
     ],
