@@ -293,19 +293,14 @@ class IrradianceCache:
         number = np.clip(wanted, 1, settings.most_hemispheres).astype(np.int64)
         closeness = 1 / spread[:, 0].astype(np.float64)
         # All that follow the first, those of one record next to each other: a call takes as long as many rays.
-        end = np.cumsum(number - 1)
-        for piece in range(-(-int(end[-1]) // self._hemispheres_at_once())):
-            rows = np.flatnonzero((number > 1) & ((end - 1) // self._hemispheres_at_once() == piece))
-            if len(rows) == 0:
-                continue
-            of_row = number[rows] - 1
-            first = np.cumsum(of_row) - of_row
-            row = np.repeat(rows, of_row)
-            which = np.arange(1, len(row) + 1) - np.repeat(first, of_row)
+        for rows in _in_pieces(number - 1, self._hemispheres_at_once()):
+            more = number[rows] - 1
+            first = np.cumsum(more) - more
+            row, further = np.repeat(rows, more), np.arange(1, more.sum() + 1) - np.repeat(first, more)
             some = take_points(points, row)
-            rays = self.tracer.trace(some, record[row] + which * _NEXT_HEMISPHERE)
-            more, other = self.sums(rays, rays.radiance(self.cells))
-            for column, new in zip(values, more, strict=True):
+            rays = self.tracer.trace(some, record[row] + further * _NEXT_HEMISPHERE)
+            found, other = self.sums(rays, rays.radiance(self.cells))
+            for column, new in zip(values, found, strict=True):
                 column[rows] += np.add.reduceat(new, first)
             closeness[rows] += np.add.reduceat(1 / other[:, 0].astype(np.float64), first)
             spread[rows, 1] = np.minimum(spread[rows, 1], np.minimum.reduceat(other[:, 1], first))
@@ -384,6 +379,13 @@ class IrradianceCache:
             np.concatenate([c.reshape(self.n, -1) for c in self.table], axis=1, out=row[:, :9])
             self._index = kernels.RecordHash(np.unique(level), slot, record[order], row)
         return self._index
+
+
+def _in_pieces(number: I64, most: int) -> list[I64]:
+    """Rows with numbers above 0, in pieces whose numbers add up to about `most`."""
+    rows = np.flatnonzero(number)
+    piece = (np.cumsum(number[rows]) - 1) // most
+    return [part for part in np.split(rows, np.flatnonzero(np.diff(piece)) + 1) if len(part)]
 
 
 def overture(cache: IrradianceCache, places: Places, pixel: I32, width: int, progress: Progress = silent) -> Placed:

@@ -37,7 +37,7 @@ ENCODINGS = ("object", "brush", "vector", "recipe", "rows")
 _COUNTS, _QUICK_COUNTS = (1, 8, 64), (1, 3)
 #: Of those that gather rays of their own, or look rows up, which takes minutes by the dozen.
 _FEWER = {"recipe": (1, 8), "rows": (1, 8)}
-_ROUNDS, _QUICK_ROUNDS = 7, 1
+_ROUNDS, _QUICK_ROUNDS = 15, 1  # a ratio of two frames varies by some percent
 _MUCH = 4.0  #: what takes so many times as long as none is timed once: its ratio needs no third digit
 
 #: Times of none that edits may take, by how many; one of sampled rows has a bound of its own. And how much faster a
