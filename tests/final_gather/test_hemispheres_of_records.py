@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from icheat_usd.final_gather import CacheSettings
+from icheat_usd.final_gather import CacheSettings, irradiance_cache
 from icheat_usd.final_gather.irradiance_cache import IrradianceCache, overture
-from icheat_usd.final_gather.record_rays import HemisphereTracer
+from icheat_usd.final_gather.record_rays import HemisphereTracer, take_rays
 from icheat_usd.kernels.record_rays import hemisphere_directions, turn_of
 from icheat_usd.kernels.samples import basis
 from icheat_usd.materials import points_on_surface
@@ -72,3 +72,19 @@ def test_half_the_noise_asks_for_twice_the_hemispheres():
     coarse, fine = (counts(noise)[0] for noise in (0.004, 0.002))
     assert coarse.min() == 1 and coarse.mean() > 4
     assert 1.8 < fine.mean() / coarse.mean() < 2.1
+
+
+def test_a_record_is_the_mean_of_its_hemispheres_however_many_are_traced_at_once(monkeypatch):
+    number, cache, _ = counts(0.02)
+    assert number.max() > 4 and (number == 1).any()
+    streams, expected = cache.rays.stream, np.zeros_like(cache.values.irradiance)
+    for k in range(int(number.max())):
+        rows = np.flatnonzero(streams // NEXT == k)
+        rays = take_rays(cache.rays, rows)
+        expected[cache.owner[rows]] += cache.sums(rays, rays.radiance(cache.cells))[0].irradiance
+    np.testing.assert_allclose(cache.values.irradiance, expected / number[:, None], rtol=1e-5)
+    monkeypatch.setattr(irradiance_cache, "_RAYS_AT_ONCE", 7 * cache.settings.n_theta * cache.settings.n_phi)
+    again, in_pieces, _ = counts(0.02)
+    assert (again == number).all()
+    for one, other in zip(in_pieces.values, cache.values, strict=True):
+        np.testing.assert_array_equal(one, other)
