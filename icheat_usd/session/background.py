@@ -19,6 +19,9 @@ Job = Callable[[], None]
 #: Longest that a piece of work is put off for commands.
 _PATIENCE_SECONDS = 0.5
 
+#: From one `tidy` to the next.
+_TIDY_SECONDS = 60.0
+
 
 class Stopped(BaseException):
     """Raised out of background work that is not wanted any more; nobody but `Background` catches it."""
@@ -35,6 +38,8 @@ class Background:
         Told of an exception that a job raised; the next job is asked for then, so it must not be the same again.
     may_overlap
         Whether work and commands may run at the same time; else the work holds the lock between its reports.
+    tidy
+        Called now and then, without the lock, and a last time when nothing is left to do.
     """
 
     def __init__(
@@ -42,6 +47,7 @@ class Background:
         next_job: Callable[[], Job | None],
         on_error: Callable[[Exception], None],
         may_overlap: Callable[[], bool] = lambda: True,
+        tidy: Callable[[], None] = lambda: None,
     ) -> None:
         self.lock = threading.RLock()  #: held by every command, and by jobs while they touch what commands use
         self._changed = threading.Condition()
@@ -51,6 +57,7 @@ class Background:
         self._commands = 0
         self._wakes = 0
         self._next_job, self._on_error, self._may_overlap = next_job, on_error, may_overlap
+        self._tidy, self._tidied, self._is_tidy = tidy, time.monotonic(), True
         self._thread = threading.Thread(target=self._run, name="icheat background", daemon=True)
 
     def start(self) -> None:
@@ -130,18 +137,33 @@ class Background:
                 wakes = self._wakes
                 self._obsolete = False
             try:
+                self._tidy_up()
                 job = self._next_job()
                 if job is None:
-                    with self._changed:
-                        while self._wakes == wakes and not self._closing:
-                            self._changed.wait()
+                    self._wait_for_wake(wakes)
                     continue
+                self._is_tidy = False
                 self._do(job)
             except Stopped:
                 continue
             except Exception as error:
                 self._on_error(error)
             self.notify()
+
+    def _wait_for_wake(self, wakes: int) -> None:
+        """Wait for one after so many, or for the time to tidy up."""
+        with self._changed:
+            while self._wakes == wakes and not self._closing:
+                left = None if self._is_tidy else self._tidied + _TIDY_SECONDS - time.monotonic()
+                if left is not None and left <= 0:
+                    return
+                self._changed.wait(left)
+            self._is_tidy = False
+
+    def _tidy_up(self) -> None:
+        if not self._is_tidy and time.monotonic() >= self._tidied + _TIDY_SECONDS:
+            self._tidy()
+            self._tidied, self._is_tidy = time.monotonic(), True
 
     def _do(self, job: Job) -> None:
         self.progress()

@@ -23,6 +23,7 @@ from icheat_usd.session.document import Session
 from icheat_usd.session.evaluator import Evaluator
 from icheat_usd.session.first_look import surfaces_by_headlight
 from icheat_usd.session.frames import ResidentFrames, SharedParts, share_tables
+from icheat_usd.session.freed_memory import give_freed_memory_back
 from icheat_usd.session.live_events import Level, Listener, LiveEvent
 from icheat_usd.session.live_state import UNCHANGED, LiveState
 from icheat_usd.session.quality import coarse
@@ -76,7 +77,7 @@ class LiveFrames:
         self._asked: tuple[float | None, Level] = (None, Level.NONE)  #: what the background is to make
         self._job: tuple[float | None, Level] = self._asked  #: what it makes for that, which may be better
         start_workers()
-        self._background = Background(self._next_job, self._on_error, kernels_may_overlap)
+        self._background = Background(self._next_job, self._on_error, kernels_may_overlap, give_freed_memory_back)
         self._background.start()
 
     # For commands -----------------------------------------------------------------------------------------------------
