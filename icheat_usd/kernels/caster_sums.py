@@ -34,8 +34,50 @@ class RayTable(NamedTuple):
     end_face_uv: NDArray[np.float32]  #: (n_detours, 2)
 
 
+class WeightRoom(NamedTuple):
+    """What `ray_weights` knows of hemispheres before it has seen one, and where it works: each thread has its own."""
+
+    ring: NDArray[np.float64]  #: (n_theta, 4) slope of a turn, steps at the inner and the outer edge, width
+    cos: NDArray[np.float32]  #: (n_phi + 1,) of the angles of sectors' edges from the first
+    sin: NDArray[np.float32]  #: (n_phi + 1,)
+    turned: NDArray[np.float32]  #: (4, n_phi + 1) scratch, as all that follow
+    close: NDArray[np.float32]  #: (n_rays,)
+    side: NDArray[np.float32]  #: (n_phi + 1,)
+    step: NDArray[np.float32]  #: (n_phi,)
+    by: NDArray[np.float32]  #: (4, n)
+    weights: NDArray[np.float32]  #: (n, 4) what it finds; n is n_rays or a little more
+
+
 @kernel
-def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: ignore[no-untyped-def]
+def weight_room(n_theta, n_phi):  # type: ignore[no-untyped-def]
+    """Room for `ray_weights` of hemispheres of so many rings and sectors."""
+    m, n = n_theta, n_phi
+    ring, cos, sin = np.empty((m, 4)), np.empty(n + 1, np.float32), np.empty(n + 1, np.float32)
+    for k in range(n + 1):
+        cos[k], sin[k] = np.cos(2.0 * np.pi * k / n), np.sin(2.0 * np.pi * k / n)
+    for j in range(m):
+        u = (j + 0.5) / m
+        ring[j, 0] = np.pi / (m * n) * np.sqrt(u / (1.0 - u))
+        # Nothing is inside of the first ring, or outside of the last.
+        ring[j, 1] = (1.0 - j / m) * np.sqrt(j / m) * 2.0 * np.pi / n
+        ring[j, 2] = (1.0 - (j + 1) / m) * np.sqrt((j + 1) / m) * 2.0 * np.pi / n
+        ring[j, 3] = np.sqrt((j + 1) / m) - np.sqrt(j / m)
+    room = -(-m * n // 16) * 16
+    return WeightRoom(
+        ring,
+        cos,
+        sin,
+        np.empty((4, n + 1), np.float32),
+        np.empty(m * n, np.float32),
+        np.empty(n + 1, np.float32),
+        np.empty(n, np.float32),
+        np.empty((4, room), np.float32),
+        np.empty((room, 4), np.float32),
+    )
+
+
+@kernel
+def ray_weights(distance, r, first_turn, factor, room):  # type: ignore[no-untyped-def]
     """How much each ray of hemisphere `r` counts: in its gradient with turns, and with place, along both tangents each.
 
     A ray counts in the differences to the four beside it, with one sign or the other (`record_sums`).
@@ -46,40 +88,44 @@ def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: 
         Where the first azimuth lies.
     factor : float
         On the hemisphere.
-    out : (n, 4) float32, out
-        `n` as of `room_of_weights`.
+    room : WeightRoom
+        The result is its `weights`.
     """
-    m, n = n_theta, n_phi
-    close, turned, side = np.empty(m * n, np.float32), np.empty((4, n + 1), np.float32), np.empty(n + 1, np.float32)
-    by = np.empty((4, len(out)), np.float32)
+    ring, cos, sin, turned, close, side, step = (
+        room.ring,
+        room.cos,
+        room.sin,
+        room.turned,
+        room.close,
+        room.side,
+        room.step,
+    )
+    by, out, own = room.by, room.weights, distance[r]
     cos_middle, sin_middle, cos_edge, sin_edge = turned[0], turned[1], turned[2], turned[3]
-    own, step = distance[r], np.empty(n, np.float32)
+    m, n = len(ring), len(step)
     for ray in range(m * n):
         close[ray] = np.float32(1.0) / max(own[ray], _TOUCHING)
-    # Middles and edges of sectors, each a turn of the one before.
-    cos, sin = np.cos(2.0 * np.pi / n), np.sin(2.0 * np.pi / n)
-    across, along = np.cos(2.0 * np.pi * (0.5 / n + first_turn)), np.sin(2.0 * np.pi * (0.5 / n + first_turn))
-    edge_across, edge_along = np.cos(2.0 * np.pi * first_turn), np.sin(2.0 * np.pi * first_turn)
+    # Edges and middles of sectors, turned from those of a hemisphere that begins at no angle.
+    across, along = np.float32(np.cos(2.0 * np.pi * first_turn)), np.float32(np.sin(2.0 * np.pi * first_turn))
     for k in range(n + 1):
-        cos_middle[k], sin_middle[k], cos_edge[k], sin_edge[k] = across, along, edge_across, edge_along
-        across, along = across * cos - along * sin, along * cos + across * sin
-        edge_across, edge_along = edge_across * cos - edge_along * sin, edge_along * cos + edge_across * sin
+        cos_edge[k] = cos[k] * across - sin[k] * along
+        sin_edge[k] = sin[k] * across + cos[k] * along
+    half = 2.0 * np.pi * (first_turn + 0.5 / n)
+    across, along = np.float32(np.cos(half)), np.float32(np.sin(half))
+    for k in range(n + 1):
+        cos_middle[k] = cos[k] * across - sin[k] * along
+        sin_middle[k] = sin[k] * across + cos[k] * along
     for j in range(m):
-        u = (j + 0.5) / m
-        slope = np.float32(np.pi / (m * n) * factor * np.sqrt(u / (1.0 - u)))
-        sector = 2.0 * np.pi / n * factor
-        # Nothing is inside of the first ring, or outside of the last.
-        low = np.float32((1.0 - j / m) * np.sqrt(j / m) * sector)
-        high = np.float32((1.0 - (j + 1) / m) * np.sqrt((j + 1) / m) * sector)
+        slope, low = np.float32(factor * ring[j, 0]), np.float32(factor * ring[j, 1])
+        high, width = np.float32(factor * ring[j, 2]), np.float32(factor * ring[j, 3])
         inside, outside = (j * n - n if j > 0 else j * n), (j * n + n if j + 1 < m else j * n)
-        width = np.float32(factor * (np.sqrt((j + 1) / m) - np.sqrt(j / m)))
         # Loops over slices, with one result each, run over many rays at once: in a third of the time.
-        ring, inner, outer = close[j * n : j * n + n], close[inside : inside + n], close[outside : outside + n]
+        own_ring, inner, outer = close[j * n : j * n + n], close[inside : inside + n], close[outside : outside + n]
         for k in range(n):
-            step[k] = low * max(ring[k], inner[k]) - high * max(ring[k], outer[k])
+            step[k] = low * max(own_ring[k], inner[k]) - high * max(own_ring[k], outer[k])
         for k in range(1, n):
-            side[k] = width * max(ring[k], ring[k - 1])
-        side[0] = side[n] = width * max(ring[0], ring[n - 1])
+            side[k] = width * max(own_ring[k], own_ring[k - 1])
+        side[0] = side[n] = width * max(own_ring[0], own_ring[n - 1])
         turn_a, turn_b = by[0, j * n : j * n + n], by[1, j * n : j * n + n]
         move_a, move_b = by[2, j * n : j * n + n], by[3, j * n : j * n + n]
         for k in range(n):
@@ -98,13 +144,6 @@ def ray_weights(distance, r, first_turn, n_theta, n_phi, factor, out):  # type: 
             load(by_0 + 2 * plane + q),
             load(by_0 + 3 * plane + q),
         )
-    by[0, 0] = np.float32(0.0)  # keeps it: Numba may free an array after its last mention
-
-
-@kernel
-def room_of_weights(n_rays):  # type: ignore[no-untyped-def]
-    """Rows that `ray_weights` needs for so many rays."""
-    return -(-n_rays // 16) * 16
 
 
 @parallel_kernel

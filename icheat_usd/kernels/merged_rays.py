@@ -7,18 +7,64 @@ light from where these weights have their mean: what is missed is how two masks 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import ray_weights, room_of_weights
+from icheat_usd.kernels.caster_sums import WeightRoom, ray_weights, weight_room
 from icheat_usd.kernels.mask_sheets import add_texel, add_weights_in_sheet
 from icheat_usd.kernels.record_lanes import LANES, add_ray
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.simd import address_of, black, color_product, load_color, load_rgb, store_color
-from icheat_usd.kernels.texels import corner_texels
+from icheat_usd.kernels.texels import near_texels
 
 _FEW = 4
+
+#: More turns than there are threads; each has records from everywhere, and memory of its own, which only pays for
+#: several of them.
+_TURNS, _LEAST_OF_TURN = 64, 8
+
+
+class RayRoom(NamedTuple):
+    """Where the rays of one record after the other are taken together: each thread has its own."""
+
+    weights: WeightRoom
+    bright: NDArray[np.float32]  #: (n_rays of the longest record,) light of what is kept
+    key: NDArray[np.int64]  #: (a power of two,) instances, and behind these patches; -1 for none
+    kept: NDArray[np.int64]  #: (the same,) what is kept of each
+
+
+@kernel
+def ray_room(n_hemispheres, n_theta, n_phi, n_keys):  # type: ignore[no-untyped-def]
+    """Room for `merge_record`; instances and patches are `n_keys` together."""
+    n = n_hemispheres * n_theta * n_phi
+    n_places = 4
+    while n_places < 2 * min(n, n_keys):
+        n_places *= 2
+    return RayRoom(
+        weight_room(n_theta, n_phi),
+        np.empty(n, np.float32),
+        np.full(n_places, -1, np.int64),
+        np.empty(n_places, np.int64),
+    )
+
+
+@kernel
+def number_of_turns(n_records):  # type: ignore[no-untyped-def]
+    """In how many turns threads take so many records: turn t has records t, t + n, t + 2 n and so on."""
+    return min(_TURNS, (n_records + _LEAST_OF_TURN - 1) // _LEAST_OF_TURN)
+
+
+@kernel
+def most_of_turn(turn, group):  # type: ignore[no-untyped-def]
+    """Hemispheres of the record of a turn that has most of them."""
+    most = np.int64(0)
+    for g in range(turn, len(group) - 1, number_of_turns(len(group) - 1)):
+        most = max(most, group[g + 1] - group[g])
+    return most
 
 
 @parallel_kernel
@@ -71,7 +117,56 @@ def merge_rays(  # type: ignore[no-untyped-def]
         Mean of the sheets' columns: of rays in patches as the nearest texels of the finest sheet have them.
     light : (n_groups, room, n_blocks, LANES) float32, out
     """
-    for g in prange(len(record)):
+    for turn in prange(number_of_turns(len(record))):
+        _merge_some(
+            np.int64(turn),
+            rays,
+            face,
+            face_uv,
+            sent,
+            order,
+            group,
+            record,
+            share,
+            selected,
+            sheets,
+            patches,
+            plateaus,
+            seed,
+            n_theta,
+            n_phi,
+            number,
+            caster,
+            weights,
+            light,
+        )
+
+
+@kernel
+def _merge_some(  # type: ignore[no-untyped-def]
+    turn,
+    rays,
+    face,
+    face_uv,
+    sent,
+    order,
+    group,
+    record,
+    share,
+    selected,
+    sheets,
+    patches,
+    plateaus,
+    seed,
+    n_theta,
+    n_phi,
+    number,
+    caster,
+    weights,
+    light,
+):
+    room = ray_room(most_of_turn(turn, group), n_theta, n_phi, len(selected) + max(patches.number, plateaus.number))
+    for g in range(turn, len(record), number_of_turns(len(record))):
         number[g] = merge_record(
             order,
             group[g],
@@ -86,8 +181,7 @@ def merge_rays(  # type: ignore[no-untyped-def]
             patches,
             plateaus,
             seed,
-            n_theta,
-            n_phi,
+            room,
             caster[g],
             weights[g],
             light[g],
@@ -124,14 +218,13 @@ def merge_record(  # type: ignore[no-untyped-def]
     patches,
     plateaus,
     seed,
-    n_theta,
-    n_phi,
+    room,
     caster,
     weights,
     light,
 ):
     """`merge_rays` of one record: how many are left of the rays of hemispheres ``order[first:end]``."""
-    room = rays.cell.shape[1] * (end - first)
+    n_rays = rays.cell.shape[1] * (end - first)
     n, n_seen = _take_together(
         order,
         first,
@@ -144,10 +237,9 @@ def merge_record(  # type: ignore[no-untyped-def]
         selected,
         sheets,
         patches,
-        room // _FEW if weights.shape[1] > 0 else room,
+        n_rays // _FEW if weights.shape[1] > 0 else n_rays,
         seed,
-        n_theta,
-        n_phi,
+        room,
         caster,
         weights,
         light,
@@ -165,10 +257,9 @@ def merge_record(  # type: ignore[no-untyped-def]
             selected,
             sheets,
             plateaus,
-            room,
+            n_rays,
             seed,
-            n_theta,
-            n_phi,
+            room,
             caster,
             weights,
             light,
@@ -191,24 +282,17 @@ def _take_together(  # type: ignore[no-untyped-def]
     patches,
     most,
     seed,
-    n_theta,
-    n_phi,
+    room,
     caster,
     weights,
     light,
 ):
     """How many are left of a record's rays, and how many there are; it gives up when more than `most` are left."""
     width, n_rays, n_blocks, n_instances = weights.shape[1], rays.cell.shape[1], sent.shape[1], len(selected)
-    room = n_rays * (end - first)
-    ray_weight = np.empty((room_of_weights(n_rays), 4), np.float32)
-    bright = np.empty(room, np.float32)
-    # Instances, and behind these patches, and what is kept of each.
-    n_places = 4
-    while n_places < 2 * min(room, n_instances + patches.number):
-        n_places *= 2
-    key, kept = np.full(n_places, -1, np.int64), np.empty(n_places, np.int64)
+    weight_room, bright, key, kept = room.weights, room.bright, room.key, room.kept
+    key[:] = -1
     light_0, sent_0, texels_0 = address_of(light), address_of(sent), address_of(sheets.texels)
-    mean_0, weight_0, throughput_0 = address_of(weights), address_of(ray_weight), address_of(rays.throughput)
+    mean_0, weight_0, throughput_0 = address_of(weights), address_of(weight_room.weights), address_of(rays.throughput)
     cell, instance, triangle, uv, throughput = rays.cell, rays.instance, rays.triangle, rays.uv, rays.throughput
     detour, end_instance, end_face, end_face_uv = rays.detour, rays.end_instance, rays.end_face, rays.end_face_uv
     adjusted_ray, detour_begin, adjusted_begin = rays.adjusted, rays.detour_begin, rays.adjusted_begin
@@ -220,7 +304,7 @@ def _take_together(  # type: ignore[no-untyped-def]
     first_sheet, sheet_end, own_first, size = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for k in range(first, end):
         r = order[k]
-        ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), n_theta, n_phi, factor, ray_weight)
+        ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), factor, weight_room)
         d, d_end, a, a_end = detour_begin[r], detour_begin[r + 1], adjusted_begin[r], adjusted_begin[r + 1]
         next_detour = detour[d] - r * n_rays if d < d_end else n_rays
         next_adjusted = adjusted_ray[a] - r * n_rays if a < a_end else n_rays
@@ -256,11 +340,10 @@ def _take_together(  # type: ignore[no-untyped-def]
                     u = np.float32(1.0) - v - w
                     s = u * face_uv[hit, 0, 0] + v * face_uv[hit, 1, 0] + w * face_uv[hit, 2, 0]
                     t = u * face_uv[hit, 0, 1] + v * face_uv[hit, 1, 1] + w * face_uv[hit, 2, 1]
-                top_left, top_right, left, _, x, y = corner_texels(size, s, t)
+                cell_of_face, nearest = near_texels(size, s, t)
                 first_texel = own_face * size * size
-                nearest = first_texel + (left if y > np.float32(0.5) else top_left)
-                nearest += top_right - top_left if x > np.float32(0.5) else 0
-                own_patch = patch[own_first + first_texel + top_left]
+                nearest += first_texel
+                own_patch = patch[own_first + first_texel + cell_of_face]
                 own_key = n_instances + own_patch if own_patch >= 0 else np.int64(-1)
             if own_key < 0 or own_key != last_key:
                 # Rays without a patch are kept apart.

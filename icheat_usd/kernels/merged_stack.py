@@ -9,13 +9,9 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.merged_rays import merge_record
+from icheat_usd.kernels.merged_rays import merge_record, most_of_turn, number_of_turns, ray_room
 from icheat_usd.kernels.record_lanes import LANES
-from icheat_usd.kernels.stack_sums import stack_of_record
-
-#: More turns than there are threads; each has records from everywhere, and memory of its own, which only pays for
-#: several of them.
-_TURNS, _LEAST_OF_TURN = 64, 8
+from icheat_usd.kernels.stack_sums import no_lines, stack_of_record
 
 
 @parallel_kernel
@@ -55,11 +51,9 @@ def stack_of_rays(  # type: ignore[no-untyped-def]
     casters, column, factor, stack, slots, values, derivative
         As of `stack_sums.stack_of_casters`.
     """
-    n_turns = min(_TURNS, (len(record) + _LEAST_OF_TURN - 1) // _LEAST_OF_TURN)
-    for turn in prange(n_turns):
+    for turn in prange(number_of_turns(len(record))):
         _stack_of_some(
             np.int64(turn),
-            n_turns,
             rays,
             face,
             face_uv,
@@ -89,7 +83,6 @@ def stack_of_rays(  # type: ignore[no-untyped-def]
 @kernel
 def _stack_of_some(  # type: ignore[no-untyped-def]
     turn,
-    n_turns,
     rays,
     face,
     face_uv,
@@ -114,13 +107,15 @@ def _stack_of_some(  # type: ignore[no-untyped-def]
     values,
     derivative,
 ):
-    most = np.int64(0)
+    n_turns, most = number_of_turns(len(record)), most_of_turn(turn, group)
+    room = ray_room(most, n_theta, n_phi, len(selected) + max(patches.number, plateaus.number))
+    n_slots = np.int64(0)
     for g in range(turn, len(record), n_turns):
-        most = max(most, group[g + 1] - group[g])
-    room = rays.cell.shape[1] * most
-    entry = np.arange(room)
-    caster, weights = np.empty(room, np.int32), np.empty((room, width), np.float32)
-    light = np.empty((room, sent.shape[1], LANES), np.float32)
+        n_slots = max(n_slots, slots.begin[record[g] + 1] - slots.begin[record[g]])
+    lines, n_rays = no_lines(n_slots, stack), rays.cell.shape[1] * most
+    entry = np.arange(n_rays)
+    caster, weights = np.empty(n_rays, np.int32), np.empty((n_rays, width), np.float32)
+    light = np.empty((n_rays, sent.shape[1], LANES), np.float32)
     for g in range(turn, len(record), n_turns):
         r = record[g]
         n = merge_record(
@@ -137,14 +132,13 @@ def _stack_of_some(  # type: ignore[no-untyped-def]
             patches,
             plateaus,
             seed,
-            n_theta,
-            n_phi,
+            room,
             caster,
             weights,
             light,
         )
         stack_of_record(
-            r, 0, n, entry, caster, weights, light, casters, column, factor, stack, slots, values, derivative
+            r, lines, 0, n, entry, caster, weights, light, casters, column, factor, stack, slots, values, derivative
         )
     # Keeps them: Numba may free an array after its last mention, and compiled loops have its address.
     caster[:1], weights[:1], light[:1] = 0, np.float32(0.0), np.float32(0.0)

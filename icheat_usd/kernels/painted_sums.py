@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import ray_weights, room_of_weights
+from icheat_usd.kernels.caster_sums import ray_weights, weight_room
 from icheat_usd.kernels.record_lanes import LANES, add_change, add_ray
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.simd import address_of, color_product, load_color, load_rgb, scaled
@@ -19,6 +19,8 @@ from icheat_usd.kernels.texels import corner_texels, texel_weight
 
 #: Painted masks on one caster; with more, there are more subsets than it takes to look at the rays again.
 MOST_PAINTED = 1
+
+_CHUNK = 16  # rows that a thread takes
 
 
 @parallel_kernel
@@ -47,11 +49,56 @@ def painted_sums(  # type: ignore[no-untyped-def]
         1 to leave out the light itself, which no edit asks for that is painted.
     out : (n_sums, n_blocks, LANES) float32, out, zero before
     """
-    for r in prange(len(begin) - 1):
+    n = len(begin) - 1
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        first_row = np.int64(chunk) * _CHUNK
+        _sums_of_some(
+            first_row,
+            min(n, first_row + _CHUNK),
+            rays,
+            face,
+            face_uv,
+            sent,
+            local,
+            begin,
+            first,
+            caster,
+            share,
+            painted,
+            least,
+            seed,
+            n_theta,
+            n_phi,
+            out,
+        )
+
+
+@kernel
+def _sums_of_some(  # type: ignore[no-untyped-def]
+    first_row,
+    end_row,
+    rays,
+    face,
+    face_uv,
+    sent,
+    local,
+    begin,
+    first,
+    caster,
+    share,
+    painted,
+    least,
+    seed,
+    n_theta,
+    n_phi,
+    out,
+):
+    room = weight_room(n_theta, n_phi)
+    for r in range(first_row, end_row):
         if begin[r] < begin[r + 1]:
-            turn = turn_of(seed, rays.stream[r])
+            ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), share[r], room)
             _sums_of_row(
-                np.int64(r),
+                r,
                 rays,
                 face,
                 face_uv,
@@ -64,11 +111,10 @@ def painted_sums(  # type: ignore[no-untyped-def]
                 share[r],
                 painted,
                 least,
-                turn,
-                n_theta,
-                n_phi,
+                address_of(room.weights),
                 out,
             )
+    room.weights[0, 0] = np.float32(0.0)  # keeps it: Numba may free an array after its last mention
 
 
 @kernel
@@ -86,19 +132,14 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
     factor,
     painted,
     least,
-    first_turn,
-    n_theta,
-    n_phi,
+    weights_0,
     out,
 ):
     cell, adjusted_ray, detour = rays.cell, rays.adjusted, rays.detour
     triangle, uv, end_face, end_face_uv = rays.triangle, rays.uv, rays.end_face, rays.end_face_uv
     n_rays, n_blocks = cell.shape[1], sent.shape[1]
-    weights = np.empty((room_of_weights(n_rays), 4), np.float32)
-    ray_weights(rays.distance, r, first_turn, n_theta, n_phi, factor, weights)
     sent_0, throughput_0 = address_of(sent), address_of(rays.throughput)
     out_0 = address_of(out) + 4 * LANES * n_blocks * first[begin]
-    weights_0 = address_of(weights)
     share = np.float32(np.pi / n_rays * factor)
     adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
     d, d_end = rays.detour_begin[r], rays.detour_begin[r + 1]
@@ -147,7 +188,6 @@ def _sums_of_row(  # type: ignore[no-untyped-def]
                 if product[subset] != np.float32(0.0):
                     to = out_0 + 4 * LANES * ((base + subset) * n_blocks + block)
                     add_ray(to, scaled(light, product[subset]), share, weights_0, ray)
-    weights[0, 0] = np.float32(0.0)  # keeps it: Numba may free an array after its last mention
 
 
 @parallel_kernel

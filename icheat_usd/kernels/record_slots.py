@@ -15,11 +15,11 @@ from icheat_usd.kernels.simd import (
     address_of,
     black,
     channel,
-    color_add,
     color_product,
     difference,
     load,
     load_color,
+    load_one,
     multiply_add,
     plus_size,
     product,
@@ -133,22 +133,29 @@ def slots_of_pairs(count, record, where, pattern, known, first, slot):  # type: 
 
 
 @kernel
-def _difference(a, i, b, j, bend):  # type: ignore[no-untyped-def]
-    """How differently two rows of masks act: sum of relative changes, and what each two of them make together."""
-    n = len(bend)
-    a_0, b_0, bend_0 = address_of(a) + 4 * n * i, address_of(b) + 4 * n * j, address_of(bend)
-    total, squares = black(), black()
-    for block in range(n // 4):
-        own = difference(load_color(a_0 + 16 * block), load_color(b_0 + 16 * block))
-        own = color_product(own, load_color(bend_0 + 16 * block))
-        total, squares = plus_size(total, own), color_add(own, own, squares)
+def _change(a_0, b_0, bend_0, n):  # type: ignore[no-untyped-def]
+    """How differently two rows of `n` masks at addresses act: sum of relative changes."""
+    total = black()
+    for q in range(0, 4 * (n - n % 4), 16):
+        step = difference(load_color(a_0 + q), load_color(b_0 + q))
+        total = plus_size(total, color_product(step, load_color(bend_0 + q)))
     change = (channel(total, 0) + channel(total, 1)) + (channel(total, 2) + channel(total, 3))
-    square = (channel(squares, 0) + channel(squares, 1)) + (channel(squares, 2) + channel(squares, 3))
-    for row in range(n - n % 4, n):
-        own = abs(a[i, row] - b[j, row]) * bend[row]
-        change += own
-        square += own * own
-    return change, np.float32(0.5) * (change * change - square)
+    for q in range(4 * (n - n % 4), 4 * n, 4):
+        change += abs(load_one(a_0 + q) - load_one(b_0 + q)) * load_one(bend_0 + q)
+    return change
+
+
+@kernel
+def _is_near(change, a_0, b_0, bend_0, n, most_change, most_bend):  # type: ignore[no-untyped-def]
+    """Whether two rows of masks, `_change` apart, may share a slot."""
+    if change > most_change:
+        return False
+    # Without what each mask does alone.
+    bent = np.float32(0.5) * change * change
+    for q in range(0, 4 * n, 4):
+        own = (load_one(a_0 + q) - load_one(b_0 + q)) * load_one(bend_0 + q)
+        bent -= np.float32(0.5) * own * own
+    return bent <= most_bend
 
 
 @parallel_kernel
@@ -228,14 +235,19 @@ def _serve(  # type: ignore[no-untyped-def]
     slot,
     is_used,
 ):
+    n, masks_0, own_0, bend_0 = len(bend), address_of(masks), address_of(own_masks), address_of(bend)
+    # What changes so little bends no more than it may.
+    straight = np.float32(min(most_change, np.sqrt(2.0 * most_bend)))
     for q in range(begin, min(begin + _CHUNK, len(where))):
         p, column = where[q], which[q]
+        at = masks_0 + 4 * n * column
         for k in range(count[p]):
             r = record[p, k]
             slot[first[q] + k] = -2
             if own_pattern[r] == pattern[column]:
-                change, bent = _difference(masks, column, own_masks, r, bend)
-                if change <= most_change and bent <= most_bend:
+                own = own_0 + 4 * n * r
+                change = _change(at, own, bend_0, n)
+                if change <= straight or _is_near(change, at, own, bend_0, n, most_change, most_bend):
                     slot[first[q] + k] = -1
                     is_used[r] = 1
 
@@ -318,30 +330,34 @@ def _choose(  # type: ignore[no-untyped-def]
     centre,
 ):
     new, n_new = np.empty(MOST_SLOTS, np.int64), 0
+    n, masks_0, slots_0, bend_0 = len(bend), address_of(masks), address_of(slot_masks), address_of(bend)
     for e in range(begin[r], begin[r + 1]):
         column = which[e]
+        own = masks_0 + 4 * n * column
         best, least = np.int64(e), np.float32(np.inf)
         is_near = False
         for k in range(known_begin[r], known_begin[r + 1]):
             s = known_slot[k]
             if slot_pattern[s] != pattern[column]:
                 continue
-            change, bent = _difference(masks, column, slot_masks, s, bend)
+            there = slots_0 + 4 * n * s
+            change = _change(own, there, bend_0, n)
             if change < least:
                 best, least = -1 - s, change
-                is_near = change <= most_change and bent <= most_bend
+                is_near = _is_near(change, own, there, bend_0, n, most_change, most_bend)
                 if is_near:
                     break
         q = 0
         while q < n_new and not is_near:
-            there = which[new[q]]
+            other = which[new[q]]
             q += 1
-            if pattern[there] != pattern[column]:
+            if pattern[other] != pattern[column]:
                 continue
-            change, bent = _difference(masks, column, masks, there, bend)
+            there = masks_0 + 4 * n * other
+            change = _change(own, there, bend_0, n)
             if change < least:
                 best, least = new[q - 1], change
-                is_near = change <= most_change and bent <= most_bend
+                is_near = _is_near(change, own, there, bend_0, n, most_change, most_bend)
         if not is_near and (n_new < MOST_SLOTS or best == e):
             best = np.int64(e)
             if n_new < MOST_SLOTS:

@@ -284,6 +284,12 @@ def store_rgb(builder: Any, values: Any) -> None:
     builder.store(rgb, _at(builder, values[0], ir.VectorType(_F32, 3)), align=4)
 
 
+@_operation(types.float32, types.int64)
+def load_one(builder: Any, values: Any) -> Any:
+    """The float32 at an address."""
+    return builder.load(_at(builder, values[0], _F32), align=4)
+
+
 @_operation(types.int64, types.int64)
 def load_byte(builder: Any, values: Any) -> Any:
     """A whole number of 8 bits, from 0 up, from an address."""

@@ -50,7 +50,7 @@ class SlotTable(NamedTuple):
     derived: NDArray[np.int64]  #: (n_slots + 1,) first derivative of each slot
 
 
-class _Lines(NamedTuple):
+class Lines(NamedTuple):
     """Edits that act on the last few casters, up to n_rows of each, for the slots of one record.
 
     Compiled loops read these arrays by themselves, as to look into a tuple again and again took half the time. What
@@ -73,15 +73,16 @@ class _Lines(NamedTuple):
 
 
 @kernel
-def _no_lines(n_slots, stack):  # type: ignore[no-untyped-def]
+def no_lines(n_slots, stack):  # type: ignore[no-untyped-def]
+    """Room for the edits of one record after the other, none of which has more slots."""
     n_rows, n_blocks = stack.slope.shape[0], stack.slope.shape[1]
     line = np.empty((n_rows, n_blocks, 2, 4), np.float32)
     line[:, :, 0] = stack.slope
     line[:, :, 1] = stack.shift
     n = _HELD * n_rows
-    return _Lines(
+    return Lines(
         np.full(_HELD, -1, np.int64),
-        np.zeros(_HELD, np.int64),
+        np.empty(_HELD, np.int64),
         np.empty(n, np.uint8),
         np.empty(n, np.int64),
         np.empty(n, np.float32),
@@ -194,6 +195,7 @@ def stack_of_casters(  # type: ignore[no-untyped-def]
         r = records[g]
         stack_of_record(
             r,
+            no_lines(slots.begin[r + 1] - slots.begin[r], stack),
             begin[r],
             begin[r + 1],
             entry,
@@ -212,12 +214,26 @@ def stack_of_casters(  # type: ignore[no-untyped-def]
 
 @kernel
 def stack_of_record(  # type: ignore[no-untyped-def]
-    r, begin, end_of_entries, entry, caster, weights, light, casters, column, factor, stack, slots, values, derivative
+    r,
+    lines,
+    begin,
+    end_of_entries,
+    entry,
+    caster,
+    weights,
+    light,
+    casters,
+    column,
+    factor,
+    stack,
+    slots,
+    values,
+    derivative,
 ):
-    """`stack_of_casters` of record `r` alone, whose entries are ``entry[begin:end_of_entries]``."""
+    """`stack_of_casters` of record `r` alone, whose entries are ``entry[begin:end_of_entries]``; `lines` is scratch."""
     first, end = slots.begin[r], slots.begin[r + 1]
-    n_rows, n_blocks = stack.slope.shape[0], stack.slope.shape[1]
-    lines = _no_lines(end - first, stack)
+    n_rows, n_blocks, room = stack.slope.shape[0], stack.slope.shape[1], lines.own.shape[1]
+    lines.caster[:] = -1
     number, is_last, row, on_caster = lines.number, lines.is_last, lines.row, lines.weight
     place, weight, painted, held_caster = slots.place.reshape(-1), lines.at_hit, lines.column, lines.caster
     past_0, factor_0 = address_of(lines.past), address_of(lines.factor)
@@ -244,7 +260,7 @@ def stack_of_record(  # type: ignore[no-untyped-def]
             continue
         for s in range(first, end):
             for block in range(n_blocks):
-                own = own_0 + 32 * n_rows * ((held * (end - first) + s - first) * n_blocks + block)
+                own = own_0 + 32 * n_rows * ((held * room + s - first) * n_blocks + block)
                 start = load_color(start_0 + 16 * block)
                 change = _composed(own, shifts, is_last, base, n, weight, start, past_0, factor_0)
                 at = light_0 + 4 * LANES * (e * light.shape[1] + block)

@@ -189,6 +189,13 @@ def group_rows(keys, table, first, out):  # type: ignore[no-untyped-def]
     mask = len(table) - 1
     found = 0
     for k in range(len(keys)):
+        # Next to each other are often rows that are the same.
+        same = k > 0
+        for w in range(keys.shape[1]):
+            same = same and keys[k, w] == keys[k - 1, w]
+        if same:
+            out[k] = out[k - 1]
+            continue
         h = np.uint64(1469598103934665603)
         for w in range(keys.shape[1]):
             h = (h ^ keys[k, w]) * np.uint64(0x9E3779B97F4A7C15)

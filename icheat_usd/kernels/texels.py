@@ -69,6 +69,15 @@ def _bilinear(texels, uv):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def near_texels(resolution, s, t):  # type: ignore[no-untyped-def]
+    """Number of the first of the four texels around a place of a face, and of the one that is nearest."""
+    x, y = _texel_place(s, resolution), _texel_place(t, resolution)
+    half, most = np.float32(0.5), max(resolution - 2, 0)
+    first = min(np.int64(y), most) * resolution + min(np.int64(x), most)
+    return first, np.int64(y + half) * resolution + np.int64(x + half)
+
+
+@kernel
 def corner_texels(resolution, s, t):  # type: ignore[no-untyped-def]
     """Numbers of the four texels around a place of a face, row by row, and how far it is towards the later ones."""
     x0, y0 = _low_texel(s, resolution), _low_texel(t, resolution)
