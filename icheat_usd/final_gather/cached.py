@@ -27,7 +27,7 @@ from icheat_usd.final_gather.light_parts import light_of_records
 from icheat_usd.final_gather.receiver_sets import MOST_SOFT, Touched, soft_masks, touched
 from icheat_usd.final_gather.row_records import RowRecords
 from icheat_usd.kernels.random import hash_combine
-from icheat_usd.kernels.record_mixtures import lay_change
+from icheat_usd.kernels.record_mixtures import lay_change, lay_positive
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, I64, SurfacePoints
 
@@ -180,7 +180,11 @@ def under_stack(
         if g.solution is not None and g.solution.offsets is not None:
             albedo = np.take(points.albedo, at, axis=0)
             light[rest] += offset_radiance(g.field, g.solution.offsets, some.ends(), albedo)
-    edited[where] = g.field.seen(light, receivers.view_lines(), is_part=g.is_part)
+    lines = receivers.view_lines()
+    if lines is None and not g.is_part:
+        lay_positive(light, where, edited)
+    else:
+        edited[where] = g.field.seen(light, lines, is_part=g.is_part)
     return edited
 
 

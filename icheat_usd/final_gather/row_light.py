@@ -157,7 +157,8 @@ class RowLight:
         record_mixtures.mark_records(found.number, found.record, where, which, begin, entry, asked)
         pair_begin = np.empty(n_records + 1, np.int64)
         pair, place = np.empty(n_pairs, np.int64), np.empty(n_pairs, np.int64)
-        record_slots.list_pairs(found.number, found.record, where, pair_begin, pair, place)
+        everything = np.ones(n_pairs, np.bool_)
+        record_slots.list_pairs(found.number, found.record, where, everything, pair_begin, pair, place)
         n_bases, n_sums = len(self._record), self._n
         self._add_bases(asked.view(np.bool_) & (self._slot < 0))
         active = self._stack.acting_payloads(self._acts)

@@ -147,7 +147,8 @@ class SlotChoices:
         )
         own_slot = np.full(n_records, -1, np.int64)
         own_slot[slots.record[slots.is_own]] = np.flatnonzero(slots.is_own)
-        n_left = int((slot == -2).sum())
+        is_left = slot == -2
+        n_left = int(is_left.sum())
         if len(slots.record) == 0 and n_left < _FEW_LEFT * len(slot):
             # Other bands of the image will ask for the rest: rays of all are looked through once.
             used |= self.likely().view(np.uint8)
@@ -155,7 +156,7 @@ class SlotChoices:
         # The few others, by record.
         begin, pair, place = np.zeros(n_records + 1, np.int64), np.empty(n_left, np.int64), np.empty(n_left, np.int64)
         if n_left:
-            kernels.list_left(found.number, found.record, where, first, slot, begin, pair, place)
+            kernels.list_pairs(found.number, found.record, where, is_left, begin, pair, place)
         number_left, column = np.diff(begin), which[place]
         record, numbers = np.repeat(np.arange(n_records), number_left), np.arange(n_records + 1)
         known, centre = np.argsort(slots.record, kind="stable"), np.empty(len(pair), np.int64)

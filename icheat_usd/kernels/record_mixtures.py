@@ -55,6 +55,15 @@ def lay_change(base, albedo, where, change, number, light):  # type: ignore[no-u
 
 
 @parallel_kernel
+def lay_positive(light, where, out):  # type: ignore[no-untyped-def]
+    """Put light (m, 3), or 0 where it is less, into rows `where` (m,) of `out` (n, 3)."""
+    for q in prange(len(where)):
+        for c in range(3):
+            own = light[q, c]
+            out[where[q], c] = np.float32(0.0) if own < np.float32(0.0) else own
+
+
+@parallel_kernel
 def mix_records(  # type: ignore[no-untyped-def]
     at,
     facing,

@@ -36,8 +36,8 @@ _CHUNK = 256  # places
 
 
 @kernel
-def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-untyped-def]
-    """Pairs of m places and their records, by record; places of one record stay in order.
+def list_pairs(count, record, where, is_wanted, begin, pair, place):  # type: ignore[no-untyped-def]
+    """Pairs of m places and their records that are wanted, by record; those of one record stay in order.
 
     Parameters
     ----------
@@ -45,61 +45,31 @@ def list_pairs(count, record, where, begin, pair, place):  # type: ignore[no-unt
         As of `irradiance_cache.find_records`.
     where : (m,) int64
         Places that are looked at.
+    is_wanted : (n_pairs,) bool
+        By place.
     begin : (n_records + 1,) int64, out
         Pairs of each record.
-    pair : (n_pairs,) int64, out
-        Number of each among the pairs in the order of places.
-    place : (n_pairs,) int64, out
+    pair : (n_wanted,) int64, out
+        Number of each among all pairs.
+    place : (n_wanted,) int64, out
         Which of `where` it is of.
     """
     begin[:] = 0
+    n = 0
     for q in range(len(where)):
         for k in range(count[where[q]]):
-            begin[record[where[q], k] + 1] += 1
+            begin[record[where[q], k] + 1] += is_wanted[n]
+            n += 1
     for r in range(len(begin) - 1):
         begin[r + 1] += begin[r]
     n = 0
     for q in range(len(where)):
         for k in range(count[where[q]]):
-            r = record[where[q], k]
-            e = begin[r]
-            pair[e], place[e] = n, q
-            begin[r] += 1
+            if is_wanted[n]:
+                e = begin[record[where[q], k]]
+                pair[e], place[e] = n, q
+                begin[record[where[q], k]] += 1
             n += 1
-    for r in range(len(begin) - 1, 0, -1):
-        begin[r] = begin[r - 1]
-    begin[0] = 0
-
-
-@kernel
-def list_left(count, record, where, first, slot, begin, pair, place):  # type: ignore[no-untyped-def]
-    """Pairs of places and records that `served_by_own` has left, by record; those of one record stay in order.
-
-    Parameters
-    ----------
-    count, record, where : as of `list_pairs`
-    first : (m,) int64
-        First pair of each place.
-    slot : (n_pairs,) int64
-        -2 for pairs that are left.
-    begin : (n_records + 1,) int64, out
-        Pairs of each record.
-    pair, place : (n_left,) int64, out
-        Number of each among all pairs, and which of `where` it is of.
-    """
-    begin[:] = 0
-    for q in range(len(where)):
-        for k in range(count[where[q]]):
-            if slot[first[q] + k] == -2:
-                begin[record[where[q], k] + 1] += 1
-    for r in range(len(begin) - 1):
-        begin[r + 1] += begin[r]
-    for q in range(len(where)):
-        for k in range(count[where[q]]):
-            if slot[first[q] + k] == -2:
-                r = record[where[q], k]
-                pair[begin[r]], place[begin[r]] = first[q] + k, q
-                begin[r] += 1
     for r in range(len(begin) - 1, 0, -1):
         begin[r] = begin[r - 1]
     begin[0] = 0
