@@ -91,16 +91,9 @@ def ray_weights(distance, r, first_turn, factor, room):  # type: ignore[no-untyp
     room : WeightRoom
         The result is its `weights`.
     """
-    ring, cos, sin, turned, close, side, step = (
-        room.ring,
-        room.cos,
-        room.sin,
-        room.turned,
-        room.close,
-        room.side,
-        room.step,
-    )
-    by, out, own = room.by, room.weights, distance[r]
+    ring, cos, sin, turned = room.ring, room.cos, room.sin, room.turned
+    close, side, step, by, out = room.close, room.side, room.step, room.by, room.weights
+    own = distance[r]
     cos_middle, sin_middle, cos_edge, sin_edge = turned[0], turned[1], turned[2], turned[3]
     m, n = len(ring), len(step)
     for ray in range(m * n):

@@ -289,10 +289,10 @@ def _take_together(  # type: ignore[no-untyped-def]
 ):
     """How many are left of a record's rays, and how many there are; it gives up when more than `most` are left."""
     width, n_rays, n_blocks, n_instances = weights.shape[1], rays.cell.shape[1], sent.shape[1], len(selected)
-    weight_room, bright, key, kept = room.weights, room.bright, room.key, room.kept
+    of_weights, bright, key, kept = room.weights, room.bright, room.key, room.kept
     key[:] = -1
     light_0, sent_0, texels_0 = address_of(light), address_of(sent), address_of(sheets.texels)
-    mean_0, weight_0, throughput_0 = address_of(weights), address_of(weight_room.weights), address_of(rays.throughput)
+    mean_0, weight_0, throughput_0 = address_of(weights), address_of(of_weights.weights), address_of(rays.throughput)
     cell, instance, triangle, uv, throughput = rays.cell, rays.instance, rays.triangle, rays.uv, rays.throughput
     detour, end_instance, end_face, end_face_uv = rays.detour, rays.end_instance, rays.end_face, rays.end_face_uv
     adjusted_ray, detour_begin, adjusted_begin = rays.adjusted, rays.detour_begin, rays.adjusted_begin
@@ -304,7 +304,7 @@ def _take_together(  # type: ignore[no-untyped-def]
     first_sheet, sheet_end, own_first, size = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for k in range(first, end):
         r = order[k]
-        ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), factor, weight_room)
+        ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), factor, of_weights)
         d, d_end, a, a_end = detour_begin[r], detour_begin[r + 1], adjusted_begin[r], adjusted_begin[r + 1]
         next_detour = detour[d] - r * n_rays if d < d_end else n_rays
         next_adjusted = adjusted_ray[a] - r * n_rays if a < a_end else n_rays
