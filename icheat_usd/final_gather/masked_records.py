@@ -39,16 +39,6 @@ class _Values(NamedTuple):
     derivative: F32  #: (n_derivatives, LANES)
 
 
-class _Edits(NamedTuple):
-    """What `stack_sums` asks of a stack."""
-
-    casters: MaskTable
-    column: I64
-    factor: F32
-    stack: stack_sums.StackTable
-    slots: stack_sums.SlotTable
-
-
 class MaskedRecords:
     """Changes of records' irradiance under a stack that `is_of_masks`, found when a camera sample first asks for them.
 
@@ -169,7 +159,9 @@ class MaskedRecords:
                 derivative,
             )
         if self._others.any():
-            edits = _Edits(self._casters, self._weights.of_entries.column, self._casters.weight, self._stack, slots)
+            edits = stack_sums.Edits(
+                self._casters, self._weights.of_entries.column, self._casters.weight, self._stack, slots
+            )
             if self._weights.of_entries.width and not of.is_kept:
                 self._at_once(of, wanted, edits, values, derivative)
                 return
@@ -185,31 +177,11 @@ class MaskedRecords:
                     derivative,
                 )
 
-    def _at_once(self, of: Hemispheres, wanted: Bool, edits: _Edits, values: F32, derivative: F32) -> None:
+    def _at_once(self, of: Hemispheres, wanted: Bool, edits: stack_sums.Edits, values: F32, derivative: F32) -> None:
         """What other casters than those of few masks bring, where nothing of it is kept."""
-        geometry, share = self._snapshot.geometry, of.shares()
-        for rays, table, order, first, record in groups_of(of, wanted):
-            merged_stack.stack_of_rays(
-                table,
-                geometry.face,
-                geometry.face_uv,
-                self._sent,
-                order,
-                first,
-                record,
-                share,
-                self._others.view(np.uint8),
-                self._weights.of_entries.sheets,
-                self._weights.patches,
-                self._weights.plateaus,
-                self._weights.of_entries.width,
-                rays.seed,
-                rays.n_theta,
-                rays.n_phi,
-                *edits,
-                values,
-                derivative,
-            )
+        width = self._weights.of_entries.width
+        for rays in self._weights.met_by(groups_of(of, wanted), self._sent, self._others, self._snapshot.geometry):
+            merged_stack.stack_of_rays(*rays, width, *edits, values, derivative)
 
 
 def _with_room(values: F32, known: int, more: int) -> F32:

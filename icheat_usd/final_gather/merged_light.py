@@ -6,7 +6,7 @@ the receivers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +15,12 @@ from icheat_usd.edits.mask_patches import mask_patches
 from icheat_usd.edits.mask_sheets import EntrySheets, mask_sheets
 from icheat_usd.final_gather.gatherer import GatherSolution
 from icheat_usd.final_gather.hemispheres import Hemispheres
-from icheat_usd.final_gather.record_rays import RecordRays
 from icheat_usd.kernels import merged_rays as kernels
 from icheat_usd.kernels.caster_sums import RayTable
 from icheat_usd.kernels.mask_patches import MaskPatches
 from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.kernels.record_lanes import LANES
-from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot
+from icheat_usd.scene import F32, I32, I64, Bool, Geometry, SceneSnapshot
 
 #: Difference in the change of light, by all masks of a caster together, from which on rays are kept apart.
 LEAST_APART = 0.4
@@ -37,6 +36,14 @@ class PaintedWeights(NamedTuple):
     of_entries: EntrySheets
     patches: MaskPatches  #: on which they change light alike
     plateaus: MaskPatches  #: on which they are the same
+
+    def met_by(
+        self, some: Iterable[Groups], sent: F32, selected: Bool, geometry: Geometry
+    ) -> Iterator[kernels.PaintedRays]:
+        """Rays with what they meet, where cells send `sent` and `selected` (n_instances,) casters count."""
+        senders = kernels.Senders(geometry.face, geometry.face_uv, sent, selected.view(np.uint8))
+        for groups in some:
+            yield kernels.PaintedRays(*groups, senders, self.of_entries.sheets, self.patches, self.plateaus)
 
 
 def painted_weights(casters: MaskTable, on_instances: Bool, steepness: tuple[F32, F32]) -> PaintedWeights:
@@ -80,17 +87,15 @@ def merged_light(of: Hemispheres, sent: F32, selected: Bool, weights: PaintedWei
 
 
 class Groups(NamedTuple):
-    """Hemispheres ``order[first[k]:first[k + 1]]`` of each of some records."""
+    """Hemispheres of some records that were traced together."""
 
-    rays: RecordRays
-    table: RayTable  #: the same rays
-    order: I64
-    first: I64
-    record: I64
+    rays: RayTable
+    groups: kernels.RayGroups
 
 
 def groups_of(of: Hemispheres, wanted: Bool) -> Iterator[Groups]:
     """Hemispheres of the `wanted` (n,) records, some after others: those that were traced together."""
+    share = of.shares()
     for rays, owner, table in of.tables():
         order = np.flatnonzero(wanted[owner])
         if len(order) == 0:
@@ -98,7 +103,8 @@ def groups_of(of: Hemispheres, wanted: Bool) -> Iterator[Groups]:
         order = order[np.argsort(owner[order], kind="stable")]
         mine = owner[order]
         first = np.append(np.flatnonzero(np.append(True, mine[1:] != mine[:-1])), len(mine))
-        yield Groups(rays, table, order, first, mine[first[:-1]])
+        record = mine[first[:-1]]
+        yield Groups(table, kernels.RayGroups(rays.n_theta, rays.n_phi, rays.seed, order, first, record, share))
 
 
 class LightTable(NamedTuple):
@@ -201,10 +207,10 @@ class MergedLight:
         self, of: Hemispheres, snapshot: SceneSnapshot, has: Bool, n_rays: int, scratch: dict[int, F32]
     ) -> LightTable:
         """What hemispheres of some records bring; `n_rays` is how many these have."""
-        share, seen, n_rows = of.shares(), 0, 0
+        seen, n_rows = 0, 0
         rows, records = self._no_rows(0), [np.zeros(0, np.int64)]
-        for some in groups_of(of, has):
-            for record, number, found, n_seen in self._merged(some, share, snapshot, scratch):
+        for rays in self._painted.met_by(groups_of(of, has), self._sent, self._selected, snapshot.geometry):
+            for record, number, found, n_seen in self._merged(rays, scratch):
                 n, seen = int(number.sum()), seen + n_seen
                 if n_rows + n > len(rows.caster):
                     grown = self._no_rows(max(n_rows + n, int(1.1 * (n_rows + n) * n_rays / seen)))
@@ -223,43 +229,23 @@ class MergedLight:
         shape = (n, self._sent.shape[1], LANES)
         return _Rows(np.empty(n, np.int32), np.empty((n, self._width), np.float32), np.empty(shape, np.float32))
 
-    def _merged(
-        self, groups: Groups, share: F32, snapshot: SceneSnapshot, scratch: dict[int, F32]
-    ) -> Iterator[tuple[I64, I64, _Rows, int]]:
+    def _merged(self, rays: kernels.PaintedRays, scratch: dict[int, F32]) -> Iterator[tuple[I64, I64, _Rows, int]]:
         """What hemispheres of each record bring, for some records after others.
 
         Records, how many rows each has, these rows, and how many rays there were.
         """
-        geometry, (rays, table, order, first, record) = snapshot.geometry, groups
-        room = rays.n_rays * int(np.diff(first).max())
+        groups, n_rays, first = rays.groups, rays.groups.n_theta * rays.groups.n_phi, rays.groups.first
+        room = n_rays * int(np.diff(first).max())
         if self._width == 0:
             room = min(room, int(self._selected.sum()))
         at_once = max(1, _MOST_OF_SCRATCH // (room * self._row_bytes()))
-        for begin in range(0, len(record), at_once):
-            some = record[begin : begin + at_once]
-            n = len(some)
-            number = np.empty(n, np.int64)
-            found = self._scratch(n, room, scratch)
-            kernels.merge_rays(
-                table,
-                geometry.face,
-                geometry.face_uv,
-                self._sent,
-                order,
-                first[begin : begin + n + 1],
-                some,
-                share,
-                self._selected.view(np.uint8),
-                self._painted.of_entries.sheets,
-                self._painted.patches,
-                self._painted.plateaus,
-                rays.seed,
-                rays.n_theta,
-                rays.n_phi,
-                number,
-                *found,
-            )
-            yield some, number, found, rays.n_rays * int(first[begin + n] - first[begin])
+        for begin in range(0, len(groups.record), at_once):
+            record = groups.record[begin : begin + at_once]
+            n = len(record)
+            some = rays._replace(groups=groups._replace(first=first[begin : begin + n + 1], record=record))
+            number, found = np.empty(n, np.int64), self._scratch(n, room, scratch)
+            kernels.merge_rays(*some, number, *found)
+            yield record, number, found, n_rays * int(first[begin + n] - first[begin])
 
     def _scratch(self, n: int, room: int, before: dict[int, F32]) -> _Rows:
         """Rows for n records: new memory would take as long as the rays."""

@@ -14,18 +14,56 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import WeightRoom, ray_weights, weight_room
-from icheat_usd.kernels.mask_sheets import add_texel, add_weights_in_sheet
+from icheat_usd.kernels.caster_sums import RayTable, WeightRoom, ray_weights, weight_room
+from icheat_usd.kernels.mask_patches import MaskPatches
+from icheat_usd.kernels.mask_sheets import MaskSheets, add_texel, add_weights_in_sheet
 from icheat_usd.kernels.record_lanes import LANES, add_ray
 from icheat_usd.kernels.record_rays import turn_of
 from icheat_usd.kernels.simd import address_of, black, color_product, load_color, load_rgb, store_color
 from icheat_usd.kernels.texels import near_texels
 
+#: Of a record where patches leave more than one in so many rays, rays are kept apart but for plateaus: it gains
+#: little, and gradients suffer from errors that jump.
 _FEW = 4
 
 #: More turns than there are threads; each has records from everywhere, and memory of its own, which only pays for
 #: several of them.
 _TURNS, _LEAST_OF_TURN = 64, 8
+
+
+class RayGroups(NamedTuple):
+    """Hemispheres ``order[first[g]:first[g + 1]]`` of each of some records."""
+
+    n_theta: int
+    n_phi: int
+    seed: int
+    order: NDArray[np.int64]
+    first: NDArray[np.int64]  #: (n_groups + 1,)
+    record: NDArray[np.int64]  #: (n_groups,)
+    share: NDArray[np.float32]  #: (n_records,) factor on the hemispheres of each
+
+
+class Senders(NamedTuple):
+    """Surfaces that send light to records."""
+
+    face: NDArray[np.int32]  #: (n_triangles,) control faces
+    face_uv: NDArray[np.float32]  #: (n_triangles, 3, 2) places of corners in them
+    sent: NDArray[np.float32]  #: (n_cells, n_blocks, 4) by group of lights, and how bright that is; below 0: transport
+    selected: NDArray[np.uint8]  #: (n_instances,) casters that count
+
+
+class PaintedRays(NamedTuple):
+    """Rays of records, and the painted surfaces that they end on.
+
+    Parallel loops are given its parts, as they take no tuples of tuples.
+    """
+
+    rays: RayTable
+    groups: RayGroups
+    senders: Senders
+    sheets: MaskSheets
+    patches: MaskPatches  #: where rays are taken together
+    plateaus: MaskPatches  #: where all weights are the same
 
 
 class RayRoom(NamedTuple):
@@ -38,14 +76,17 @@ class RayRoom(NamedTuple):
 
 
 @kernel
-def ray_room(n_hemispheres, n_theta, n_phi, n_keys):  # type: ignore[no-untyped-def]
-    """Room for `merge_record`; instances and patches are `n_keys` together."""
-    n = n_hemispheres * n_theta * n_phi
+def ray_room(painted, turn):  # type: ignore[no-untyped-def]
+    """Room for `merge_record` of the records of a turn."""
+    groups, most = painted.groups, np.int64(0)
+    for g in range(turn, len(groups.record), number_of_turns(groups)):
+        most = max(most, groups.first[g + 1] - groups.first[g])
+    n, n_patches = most * groups.n_theta * groups.n_phi, max(painted.patches.number, painted.plateaus.number)
     n_places = 4
-    while n_places < 2 * min(n, n_keys):
+    while n_places < 2 * min(n, len(painted.senders.selected) + n_patches):
         n_places *= 2
     return RayRoom(
-        weight_room(n_theta, n_phi),
+        weight_room(groups.n_theta, groups.n_phi),
         np.empty(n, np.float32),
         np.full(n_places, -1, np.int64),
         np.empty(n_places, np.int64),
@@ -53,63 +94,21 @@ def ray_room(n_hemispheres, n_theta, n_phi, n_keys):  # type: ignore[no-untyped-
 
 
 @kernel
-def number_of_turns(n_records):  # type: ignore[no-untyped-def]
-    """In how many turns threads take so many records: turn t has records t, t + n, t + 2 n and so on."""
-    return min(_TURNS, (n_records + _LEAST_OF_TURN - 1) // _LEAST_OF_TURN)
-
-
-@kernel
-def most_of_turn(turn, group):  # type: ignore[no-untyped-def]
-    """Hemispheres of the record of a turn that has most of them."""
-    most = np.int64(0)
-    for g in range(turn, len(group) - 1, number_of_turns(len(group) - 1)):
-        most = max(most, group[g + 1] - group[g])
-    return most
+def number_of_turns(groups):  # type: ignore[no-untyped-def]
+    """In how many turns threads take records: turn t has t, t + n, t + 2 n and so on."""
+    return min(_TURNS, (len(groups.record) + _LEAST_OF_TURN - 1) // _LEAST_OF_TURN)
 
 
 @parallel_kernel
 def merge_rays(  # type: ignore[no-untyped-def]
-    rays,
-    face,
-    face_uv,
-    sent,
-    order,
-    group,
-    record,
-    share,
-    selected,
-    sheets,
-    patches,
-    plateaus,
-    seed,
-    n_theta,
-    n_phi,
-    number,
-    caster,
-    weights,
-    light,
+    rays, groups, senders, sheets, patches, plateaus, number, caster, weights, light
 ):
     """What rays bring to records, by caster and by the painted weights where they end.
 
     Parameters
     ----------
-    face : (n_triangles,) int32, face_uv : (n_triangles, 3, 2) float32
-        Control faces, and places of corners in them.
-    sent : (n_cells, n_blocks, 4) float32
-        What cells send, by group of lights, and how bright that is; below 0 where it is transport.
-    order : (n_wanted,) int64
-        Hemispheres, those of one record next to each other.
-    group : (n_groups + 1,) int64
-        Ranges of `order`, one for each record.
-    record : (n_groups,) int64, share : (n_records,) float32
-        Records, and a factor on the hemispheres of each.
-    selected : (n_instances,) uint8
-        Casters that count.
-    sheets : MaskSheets
-    patches, plateaus : MaskPatches
-        Where rays are taken together, and where all weights are the same. Of a record where patches leave more than
-        one in `_FEW` rays, rays are kept apart but for plateaus: it gains little, and gradients suffer from errors
-        that jump.
+    rays, groups, senders, sheets, patches, plateaus
+        `PaintedRays`.
     number : (n_groups,) int64, out
         How many are left of the rays of each record.
     caster : (n_groups, room) int32, out
@@ -117,75 +116,16 @@ def merge_rays(  # type: ignore[no-untyped-def]
         Mean of the sheets' columns: of rays in patches as the nearest texels of the finest sheet have them.
     light : (n_groups, room, n_blocks, LANES) float32, out
     """
-    for turn in prange(number_of_turns(len(record))):
-        _merge_some(
-            np.int64(turn),
-            rays,
-            face,
-            face_uv,
-            sent,
-            order,
-            group,
-            record,
-            share,
-            selected,
-            sheets,
-            patches,
-            plateaus,
-            seed,
-            n_theta,
-            n_phi,
-            number,
-            caster,
-            weights,
-            light,
-        )
+    for turn in prange(number_of_turns(groups)):
+        painted = PaintedRays(rays, groups, senders, sheets, patches, plateaus)
+        _merge_some(np.int64(turn), painted, number, caster, weights, light)
 
 
 @kernel
-def _merge_some(  # type: ignore[no-untyped-def]
-    turn,
-    rays,
-    face,
-    face_uv,
-    sent,
-    order,
-    group,
-    record,
-    share,
-    selected,
-    sheets,
-    patches,
-    plateaus,
-    seed,
-    n_theta,
-    n_phi,
-    number,
-    caster,
-    weights,
-    light,
-):
-    room = ray_room(most_of_turn(turn, group), n_theta, n_phi, len(selected) + max(patches.number, plateaus.number))
-    for g in range(turn, len(record), number_of_turns(len(record))):
-        number[g] = merge_record(
-            order,
-            group[g],
-            group[g + 1],
-            rays,
-            face,
-            face_uv,
-            sent,
-            share[record[g]],
-            selected,
-            sheets,
-            patches,
-            plateaus,
-            seed,
-            room,
-            caster[g],
-            weights[g],
-            light[g],
-        )
+def _merge_some(turn, painted, number, caster, weights, light):  # type: ignore[no-untyped-def]
+    room = ray_room(painted, turn)
+    for g in range(turn, len(number), number_of_turns(painted.groups)):
+        number[g] = merge_record(g, painted, room, caster[g], weights[g], light[g])
 
 
 @parallel_kernel
@@ -204,91 +144,25 @@ def _keep(g, first, end, caster, weights, light, kept_caster, kept_weights, kept
 
 
 @kernel
-def merge_record(  # type: ignore[no-untyped-def]
-    order,
-    first,
-    end,
-    rays,
-    face,
-    face_uv,
-    sent,
-    factor,
-    selected,
-    sheets,
-    patches,
-    plateaus,
-    seed,
-    room,
-    caster,
-    weights,
-    light,
-):
-    """`merge_rays` of one record: how many are left of the rays of hemispheres ``order[first:end]``."""
-    n_rays = rays.cell.shape[1] * (end - first)
-    n, n_seen = _take_together(
-        order,
-        first,
-        end,
-        rays,
-        face,
-        face_uv,
-        sent,
-        factor,
-        selected,
-        sheets,
-        patches,
-        n_rays // _FEW if weights.shape[1] > 0 else n_rays,
-        seed,
-        room,
-        caster,
-        weights,
-        light,
-    )
+def merge_record(g, painted, room, caster, weights, light):  # type: ignore[no-untyped-def]
+    """`merge_rays` of one record: how many are left of its rays."""
+    n_rays = painted.rays.cell.shape[1] * (painted.groups.first[g + 1] - painted.groups.first[g])
+    most = n_rays // _FEW if weights.shape[1] > 0 else n_rays
+    n, n_seen = _take_together(g, painted, painted.patches, most, room, caster, weights, light)
     if _FEW * n > n_seen and weights.shape[1] > 0:
-        n, n_seen = _take_together(
-            order,
-            first,
-            end,
-            rays,
-            face,
-            face_uv,
-            sent,
-            factor,
-            selected,
-            sheets,
-            plateaus,
-            n_rays,
-            seed,
-            room,
-            caster,
-            weights,
-            light,
-        )
+        n, n_seen = _take_together(g, painted, painted.plateaus, n_rays, room, caster, weights, light)
     return n
 
 
 @kernel
-def _take_together(  # type: ignore[no-untyped-def]
-    order,
-    first,
-    end,
-    rays,
-    face,
-    face_uv,
-    sent,
-    factor,
-    selected,
-    sheets,
-    patches,
-    most,
-    seed,
-    room,
-    caster,
-    weights,
-    light,
-):
+def _take_together(g, painted, patches, most, room, caster, weights, light):  # type: ignore[no-untyped-def]
     """How many are left of a record's rays, and how many there are; it gives up when more than `most` are left."""
+    # Loops look into arrays of their own: to look into tuples again and again takes half the time.
+    rays, groups, senders, sheets = painted.rays, painted.groups, painted.senders, painted.sheets
+    face, face_uv, sent, selected = senders.face, senders.face_uv, senders.sent, senders.selected
+    order, stream = groups.order, rays.stream
     width, n_rays, n_blocks, n_instances = weights.shape[1], rays.cell.shape[1], sent.shape[1], len(selected)
+    seed, factor = groups.seed, groups.share[groups.record[g]]
     of_weights, bright, key, kept = room.weights, room.bright, room.key, room.kept
     key[:] = -1
     light_0, sent_0, texels_0 = address_of(light), address_of(sent), address_of(sheets.texels)
@@ -302,9 +176,9 @@ def _take_together(  # type: ignore[no-untyped-def]
     n, n_seen, last, last_key = 0, 0, np.int64(-1), np.int64(-1)
     last_instance, is_painted = np.int64(-1), False
     first_sheet, sheet_end, own_first, size = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
-    for k in range(first, end):
+    for k in range(groups.first[g], groups.first[g + 1]):
         r = order[k]
-        ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), factor, of_weights)
+        ray_weights(rays.distance, r, turn_of(seed, stream[r]), factor, of_weights)
         d, d_end, a, a_end = detour_begin[r], detour_begin[r + 1], adjusted_begin[r], adjusted_begin[r + 1]
         next_detour = detour[d] - r * n_rays if d < d_end else n_rays
         next_adjusted = adjusted_ray[a] - r * n_rays if a < a_end else n_rays

@@ -13,6 +13,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.kernels.record_lanes import LANES, add_change
 from icheat_usd.kernels.simd import (
     address_of,
@@ -48,6 +49,16 @@ class SlotTable(NamedTuple):
     pattern: NDArray[np.int32]  #: (n_slots,)
     place: NDArray[np.int16]  #: (n_patterns, n_rows) place of the derivative by a mask among the slot's, -1 for none
     derived: NDArray[np.int64]  #: (n_slots + 1,) first derivative of each slot
+
+
+class Edits(NamedTuple):
+    """What is asked of a stack, and the masks that it is asked for; parallel loops are given its parts."""
+
+    casters: MaskTable
+    column: NDArray[np.int64]  #: (n_entries,) column of each entry of `casters` in painted weights, -1 for none
+    factor: NDArray[np.float32]  #: (n_entries,) what that is multiplied by, or the weight itself
+    stack: StackTable
+    slots: SlotTable
 
 
 class Lines(NamedTuple):
@@ -98,8 +109,9 @@ def no_lines(n_slots, stack):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _hold(i, first, end, casters, column, factor, stack, slots, lines):  # type: ignore[no-untyped-def]
+def _hold(i, first, end, edits, lines):  # type: ignore[no-untyped-def]
     """Keep the edits that act on an instance, and that receivers of the slots are in or would be nearby."""
+    casters, column, factor, stack, slots = edits.casters, edits.column, edits.factor, edits.stack, edits.slots
     held, n_rows, n_blocks = i % _HELD, len(stack.edit), stack.slope.shape[1]
     n, edit = 0, -1
     for e in range(casters.begin[i], casters.begin[i + 1]):
@@ -184,53 +196,25 @@ def stack_of_casters(  # type: ignore[no-untyped-def]
         Light by caster: `merged_rays.merge_rays`.
     weights : (k, width) float32
         Painted weights that it meets.
-    column : (n_entries,) int64, factor : (n_entries,) float32
-        Column of each entry of `casters` in `weights`, and what that is multiplied by; -1, and the weight itself.
-    casters, stack, slots : MaskTable, StackTable, SlotTable
+    casters, column, factor, stack, slots
+        `Edits`.
     records : (k,) int64
         Records with slots.
     values : (n_slots, LANES), derivative : (n_derivatives, LANES) float32, out, added to
     """
     for g in prange(len(records)):
         r = records[g]
-        stack_of_record(
-            r,
-            no_lines(slots.begin[r + 1] - slots.begin[r], stack),
-            begin[r],
-            begin[r + 1],
-            entry,
-            caster,
-            weights,
-            light,
-            casters,
-            column,
-            factor,
-            stack,
-            slots,
-            values,
-            derivative,
-        )
+        edits = Edits(casters, column, factor, stack, slots)
+        lines = no_lines(slots.begin[r + 1] - slots.begin[r], stack)
+        stack_of_record(r, lines, begin[r], begin[r + 1], entry, caster, weights, light, edits, values, derivative)
 
 
 @kernel
 def stack_of_record(  # type: ignore[no-untyped-def]
-    r,
-    lines,
-    begin,
-    end_of_entries,
-    entry,
-    caster,
-    weights,
-    light,
-    casters,
-    column,
-    factor,
-    stack,
-    slots,
-    values,
-    derivative,
+    r, lines, begin, end_of_entries, entry, caster, weights, light, edits, values, derivative
 ):
     """`stack_of_casters` of record `r` alone, whose entries are ``entry[begin:end_of_entries]``; `lines` is scratch."""
+    stack, slots = edits.stack, edits.slots
     first, end = slots.begin[r], slots.begin[r + 1]
     n_rows, n_blocks, room = stack.slope.shape[0], stack.slope.shape[1], lines.own.shape[1]
     lines.caster[:] = -1
@@ -247,7 +231,7 @@ def stack_of_record(  # type: ignore[no-untyped-def]
         i = np.int64(caster[e])
         held = i % _HELD
         if held_caster[held] != i:
-            _hold(i, first, end, casters, column, factor, stack, slots, lines)
+            _hold(i, first, end, edits, lines)
         n, base = number[held], held * n_rows
         acts = False
         for q in range(n):
