@@ -16,7 +16,7 @@ from icheat_usd.edits.mask_sheets import EntrySheets, mask_sheets
 from icheat_usd.final_gather.gatherer import GatherSolution
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.kernels import merged_rays as kernels
-from icheat_usd.kernels.caster_sums import RayTable
+from icheat_usd.kernels.caster_sums import RayTable, Senders
 from icheat_usd.kernels.mask_patches import MaskPatches
 from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.kernels.record_lanes import LANES
@@ -41,7 +41,7 @@ class PaintedWeights(NamedTuple):
         self, some: Iterable[Groups], sent: F32, selected: Bool, geometry: Geometry
     ) -> Iterator[kernels.PaintedRays]:
         """Rays with what they meet, where cells send `sent` and `selected` (n_instances,) casters count."""
-        senders = kernels.Senders(geometry.face, geometry.face_uv, sent, selected.view(np.uint8))
+        senders = Senders(geometry.face, geometry.face_uv, sent, selected.view(np.uint8))
         for groups in some:
             yield kernels.PaintedRays(*groups, senders, self.of_entries.sheets, self.patches, self.plateaus)
 

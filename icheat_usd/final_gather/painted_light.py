@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from icheat_usd.final_gather.hemispheres import Hemispheres
 from icheat_usd.final_gather.record_rays import RecordRays
 from icheat_usd.kernels import painted_sums as kernels
-from icheat_usd.kernels.caster_sums import RayTable, list_casters
+from icheat_usd.kernels.caster_sums import RayTable, Senders, list_casters
 from icheat_usd.kernels.mask_table import MaskTable
 from icheat_usd.kernels.record_lanes import LANES
 from icheat_usd.scene import F32, I32, I64, Bool, Geometry
@@ -86,6 +86,7 @@ class LightByMasks:
             return
         self._is_known |= new
         share = of.shares()
+        senders = Senders(geometry.face, geometry.face_uv, self._sent, self._selected.view(np.uint8))
         number = 1 << _numbers(self._painted)
         records, casters, values = [self.entries.record], [self.entries.caster], [self.entries.values]
         for rays, owner, table in of.tables():
@@ -95,23 +96,9 @@ class LightByMasks:
             row, caster, local, begin = list_of_casters(rays, table, self._selected, some)
             first = np.concatenate([[0], np.cumsum(number[caster])])
             light = np.zeros((int(first[-1]), *self.entries.values.shape[1:]), np.float32)
-            kernels.painted_sums(
-                table,
-                geometry.face,
-                geometry.face_uv,
-                self._sent,
-                local,
-                begin,
-                first,
-                caster,
-                share[owner],
-                self._painted,
-                self._least,
-                rays.seed,
-                rays.n_theta,
-                rays.n_phi,
-                light,
-            )
+            subsets = kernels.Subsets(local, begin, first, caster, share[owner])
+            shape = rays.seed, rays.n_theta, rays.n_phi
+            kernels.painted_sums(table, senders, subsets, self._painted, self._least, *shape, light)
             records.append(owner[row])
             casters.append(caster)
             values.append(light)

@@ -34,6 +34,15 @@ class RayTable(NamedTuple):
     end_face_uv: NDArray[np.float32]  #: (n_detours, 2)
 
 
+class Senders(NamedTuple):
+    """Surfaces that send light to records."""
+
+    face: NDArray[np.int32]  #: (n_triangles,) control faces
+    face_uv: NDArray[np.float32]  #: (n_triangles, 3, 2) places of corners in them
+    sent: NDArray[np.float32]  #: (n_cells, n_blocks, 4) by group of lights, and how bright that is; below 0: transport
+    selected: NDArray[np.uint8]  #: (n_instances,) casters that count
+
+
 class WeightRoom(NamedTuple):
     """What `ray_weights` knows of hemispheres before it has seen one, and where it works: each thread has its own."""
 

@@ -14,7 +14,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.caster_sums import RayTable, WeightRoom, ray_weights, weight_room
+from icheat_usd.kernels.caster_sums import RayTable, Senders, WeightRoom, ray_weights, weight_room
 from icheat_usd.kernels.mask_patches import MaskPatches
 from icheat_usd.kernels.mask_sheets import MaskSheets, add_texel, add_weights_in_sheet
 from icheat_usd.kernels.record_lanes import LANES, add_ray
@@ -41,15 +41,6 @@ class RayGroups(NamedTuple):
     first: NDArray[np.int64]  #: (n_groups + 1,)
     record: NDArray[np.int64]  #: (n_groups,)
     share: NDArray[np.float32]  #: (n_records,) factor on the hemispheres of each
-
-
-class Senders(NamedTuple):
-    """Surfaces that send light to records."""
-
-    face: NDArray[np.int32]  #: (n_triangles,) control faces
-    face_uv: NDArray[np.float32]  #: (n_triangles, 3, 2) places of corners in them
-    sent: NDArray[np.float32]  #: (n_cells, n_blocks, 4) by group of lights, and how bright that is; below 0: transport
-    selected: NDArray[np.uint8]  #: (n_instances,) casters that count
 
 
 class PaintedRays(NamedTuple):

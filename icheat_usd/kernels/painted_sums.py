@@ -7,8 +7,11 @@ any amounts and colours, and any masks of receivers, make of it.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.caster_sums import ray_weights, weight_room
@@ -23,124 +26,58 @@ MOST_PAINTED = 1
 _CHUNK = 16  # rows that a thread takes
 
 
+class Subsets(NamedTuple):
+    """Sums that the rays of n hemispheres are added to: of each, its casters, and of these the subsets of masks."""
+
+    local: NDArray[np.int16]  #: (n, n_rays) place of each ray's caster, as of `list_casters`
+    begin: NDArray[np.int64]  #: (n + 1,) entries of each hemisphere, one for each caster
+    first: NDArray[np.int64]  #: (m + 1,) sums of each entry, by the number of the subset: a bit for each mask
+    caster: NDArray[np.int32]  #: (m,)
+    share: NDArray[np.float32]  #: (n,) factor on each hemisphere
+
+
 @parallel_kernel
-def painted_sums(  # type: ignore[no-untyped-def]
-    rays, face, face_uv, sent, local, begin, first, caster, share, painted, least, seed, n_theta, n_phi, out
-):
+def painted_sums(rays, senders, subsets, painted, least, seed, n_theta, n_phi, out):  # type: ignore[no-untyped-def]
     """What rays bring to records by caster, times the weights of subsets of its painted masks.
 
     Parameters
     ----------
-    face : (n_triangles,) int32, face_uv : (n_triangles, 3, 2) float32
-        Control faces, and places of corners in them.
-    sent : (n_cells, n_blocks, 4) float32
-        What cells send, by group of lights, as for `merged_rays.merge_rays`.
-    local : (n, n_rays) int16, as of `list_casters`
-    share : (n,) float32
-        Factor on each hemisphere.
-    begin : (n + 1,) int64
-        Entries of each hemisphere, one for each caster.
-    first : (m + 1,) int64
-        Sums of each entry: subset A, a number with a bit for each mask of the caster, is ``first[e] + A``.
-    caster : (m,) int32
+    rays, senders, subsets : RayTable, Senders, Subsets
     painted : MaskTable
         Painted masks on each caster, no more than `MOST_PAINTED`, and nothing else.
     least : int
         1 to leave out the light itself, which no edit asks for that is painted.
     out : (n_sums, n_blocks, LANES) float32, out, zero before
     """
-    n = len(begin) - 1
+    n = len(subsets.begin) - 1
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         first_row = np.int64(chunk) * _CHUNK
-        _sums_of_some(
-            first_row,
-            min(n, first_row + _CHUNK),
-            rays,
-            face,
-            face_uv,
-            sent,
-            local,
-            begin,
-            first,
-            caster,
-            share,
-            painted,
-            least,
-            seed,
-            n_theta,
-            n_phi,
-            out,
-        )
+        end_row = min(n, first_row + _CHUNK)
+        _sums_of_some(first_row, end_row, rays, senders, subsets, painted, least, seed, n_theta, n_phi, out)
 
 
 @kernel
 def _sums_of_some(  # type: ignore[no-untyped-def]
-    first_row,
-    end_row,
-    rays,
-    face,
-    face_uv,
-    sent,
-    local,
-    begin,
-    first,
-    caster,
-    share,
-    painted,
-    least,
-    seed,
-    n_theta,
-    n_phi,
-    out,
+    first_row, end_row, rays, senders, subsets, painted, least, seed, n_theta, n_phi, out
 ):
     room = weight_room(n_theta, n_phi)
     for r in range(first_row, end_row):
-        if begin[r] < begin[r + 1]:
-            ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), share[r], room)
-            _sums_of_row(
-                r,
-                rays,
-                face,
-                face_uv,
-                sent,
-                local,
-                begin[r],
-                begin[r + 1],
-                first,
-                caster,
-                share[r],
-                painted,
-                least,
-                address_of(room.weights),
-                out,
-            )
+        if subsets.begin[r] < subsets.begin[r + 1]:
+            ray_weights(rays.distance, r, turn_of(seed, rays.stream[r]), subsets.share[r], room)
+            _sums_of_row(r, rays, senders, subsets, painted, least, address_of(room.weights), out)
     room.weights[0, 0] = np.float32(0.0)  # keeps it: Numba may free an array after its last mention
 
 
 @kernel
-def _sums_of_row(  # type: ignore[no-untyped-def]
-    r,
-    rays,
-    face,
-    face_uv,
-    sent,
-    local,
-    begin,
-    end,
-    first,
-    caster,
-    factor,
-    painted,
-    least,
-    weights_0,
-    out,
-):
+def _sums_of_row(r, rays, senders, subsets, painted, least, weights_0, out):  # type: ignore[no-untyped-def]
+    face, face_uv, sent = senders.face, senders.face_uv, senders.sent
+    local, first, caster, begin = subsets.local, subsets.first, subsets.caster, subsets.begin[r]
     cell, adjusted_ray, detour = rays.cell, rays.adjusted, rays.detour
     triangle, uv, end_face, end_face_uv = rays.triangle, rays.uv, rays.end_face, rays.end_face_uv
     n_rays, n_blocks = cell.shape[1], sent.shape[1]
     sent_0, throughput_0 = address_of(sent), address_of(rays.throughput)
     out_0 = address_of(out) + 4 * LANES * n_blocks * first[begin]
-    share = np.float32(np.pi / n_rays * factor)
+    share = np.float32(np.pi / n_rays * subsets.share[r])
     adjusted, adjusted_end = rays.adjusted_begin[r], rays.adjusted_begin[r + 1]
     d, d_end = rays.detour_begin[r], rays.detour_begin[r + 1]
     mask_begin, mask_weight, mask, first_face = painted.begin, painted.weight, painted.mask, painted.first_face
