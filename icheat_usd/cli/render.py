@@ -90,9 +90,9 @@ def at_least_0(text: str) -> int:
 
 
 def command(options: argparse.Namespace) -> int:
-    from icheat_usd.cli.memory import keep_freed_memory
     from icheat_usd.cli.sequence import render_frames
     from icheat_usd.errors import SettingsError
+    from icheat_usd.freed_memory import keep_freed_memory
     from icheat_usd.session.quality import FINAL, PREVIEW, QUICK, QUICK_CELLS
 
     start, quality = (QUICK, QUICK_CELLS) if options.quick else (FINAL, PREVIEW)

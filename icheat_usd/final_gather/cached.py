@@ -182,7 +182,7 @@ def under_stack(
             light[rest] += offset_radiance(g.field, g.solution.offsets, some.ends(), albedo)
     lines = receivers.view_lines()
     if lines is None and not g.is_part:
-        lay_positive(light, where, edited)
+        lay_positive(light, where, edited)  # as `seen` has it, in one pass
     else:
         edited[where] = g.field.seen(light, lines, is_part=g.is_part)
     return edited

@@ -148,7 +148,7 @@ def merge_record(g, painted, room, caster, weights, light):  # type: ignore[no-u
 @kernel
 def _take_together(g, painted, patches, most, room, caster, weights, light):  # type: ignore[no-untyped-def]
     """How many are left of a record's rays, and how many there are; it gives up when more than `most` are left."""
-    # Loops look into arrays of their own: to look into tuples again and again takes half the time.
+    # Loops look into arrays of their own: to look into tuples again and again took half of all time.
     rays, groups, senders, sheets = painted.rays, painted.groups, painted.senders, painted.sheets
     face, face_uv, sent, selected = senders.face, senders.face_uv, senders.sent, senders.selected
     order, stream = groups.order, rays.stream

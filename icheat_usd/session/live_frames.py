@@ -10,6 +10,7 @@ from weakref import WeakMethod
 
 from icheat_usd.edits.model import EMPTY_STACK, EditStack
 from icheat_usd.errors import IcheatError
+from icheat_usd.freed_memory import give_freed_memory_back
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
 from icheat_usd.kernels.workers import start_workers
@@ -23,7 +24,6 @@ from icheat_usd.session.document import Session
 from icheat_usd.session.evaluator import Evaluator
 from icheat_usd.session.first_look import surfaces_by_headlight
 from icheat_usd.session.frames import ResidentFrames, SharedParts, share_tables
-from icheat_usd.session.freed_memory import give_freed_memory_back
 from icheat_usd.session.live_events import Level, Listener, LiveEvent
 from icheat_usd.session.live_state import UNCHANGED, LiveState
 from icheat_usd.session.quality import coarse

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from icheat_usd.cli.memory import keep_freed_memory
+from icheat_usd.freed_memory import keep_freed_memory
 from tools.benchmarking.runner import ROOT, Benchmark, add_common_arguments, run_benchmark, work
 
 BENCHMARK = Benchmark(
