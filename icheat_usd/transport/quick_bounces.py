@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,18 @@ _ALL = (0, 1)  # every cell
 
 _WHITE, _WHITE_COUNTS = 0.9, 8  # cells of a larger albedo stand for so many
 
-# With so many bounces, an equilibrium stands for their sum. It has all bounces, which in a scene of white surfaces
-# is a few percent more; at fewer the sum is made as it is.
+# With so many bounces, an equilibrium stands for their sum, under albedos of which it has no more light; at fewer the
+# sum is made as it is.
 _LASTING = 12
+
+# Of larger albedos clusters send on so much. Light between white surfaces lasts for many bounces, and where clusters
+# have cells on both sides of such a surface, what they add for these is wrong and sent on as well.
+_SENT_ON = 0.8
+
+# An error that is left alone must shrink: over the last of so many steps, to less than this of itself in each.
+_TRIED, _LAST_TRIED = 16, 6
+_SHRINKS = 0.85
+_FACTORS = 1.0, 0.5, 0.25, 0.125  # of what clusters send on, until it does; else they send on nothing
 
 # Another step if the light was out of balance by more than this share before the last; each takes away most of it.
 _UNBALANCED = 0.04
@@ -34,7 +43,8 @@ _FAR = 0.1  # of all cells, if it was by more than this
 class QuickBounces:
     """Bounce rows of few rays in a word per entry, and the mean rows of clusters of neighbouring cells.
 
-    Light `g` after all bounces balances ``g = d + A R g`` (d direct light, A albedo, R rows). A step adds what
+    Light `g` after all bounces balances ``g = d + A R g`` (d direct light, A albedo, R rows); see `lasting_albedo`
+    for those that are not all. A step adds what
     is missing, ``r = d + A R g - g`` with the exact rows, and what becomes of `r` in further bounces between
     clusters: an iteration with a preconditioner [1]_, which gains a factor of two to ten per step. Weights
     are rounded by at most 0.4 % each at 65,536 cells, of either sign, and so is the light that they reach.
@@ -45,12 +55,13 @@ class QuickBounces:
     indptr: I64  #: (n_gather + 1,)
     entries: np.ndarray  #: (n_entries,) uint32: column in the last `column_bits`, weight's leading bits in the others
     column_bits: int
-    albedo: F32  #: (n_gather, 3)
+    albedo: F32  #: (n_gather, 3); if `lasting`, those of `lasting_albedo`
     mean_albedo: F32  #: (n_clusters, 3)
     begin: I64  #: (n_clusters + 1,) first cell of each cluster
     share: F32  #: (n_gather,) of the cell in its cluster's area
     blocks: NDArray[np.uint16]  #: later bounces, between clusters, per colour; see `kernels.reach_clusters`
     lasting: bool  #: whether there are enough bounces for a balance
+    sent_on: float  #: factor of later bounces, less than 1 where errors would grow
     scratch: F32  #: (2, n_gather, 4) for `solve` and `follow`, which thus serve one thread at a time
     short: NDArray[np.uint64]  #: (n_gather,) as well, for light that rows reach
 
@@ -132,7 +143,7 @@ class QuickBounces:
         """Add the later bounces of light that leaves clusters; and what is missing, which arrives as `here` says."""
         later = np.empty((self.n_clusters, 3), np.float32)
         take_back()
-        kernels.reach_clusters(self.blocks, leaves, later)
+        kernels.reach_clusters(self.blocks, leaves * np.float32(self.sent_on), later)
         light, missing = self.scratch
         here, missing = (later, missing[:0]) if here is None else (here, missing)
         kernels.add_missing(self.begin, self.albedo, missing, here, later, *part, light, self.short, out)
@@ -153,7 +164,8 @@ def build_quick_bounces(
     n_bounces : int
         Diffuse reflections before the last one, as for `solve_bounces`; at least 2.
     """
-    rows = bounces.few
+    rows, lasting = bounces.few, n_bounces >= _LASTING
+    albedo = lasting_albedo(bounces.albedo, n_bounces) if lasting else bounces.albedo
     bits = max(1, int(tree.n_leaves - 1).bit_length())
     entries = np.empty(rows.n_entries, np.uint32)
     kernels.shorten(rows.indices, rows.weights, bits, entries)
@@ -166,21 +178,55 @@ def build_quick_bounces(
     share = (tree.weight / area[cluster]).astype(np.float32)
     factors = np.zeros((len(size), len(size)), np.float32)
     kernels.merge_rows(begin, share, cluster, rows.indptr, rows.indices, rows.weights, factors)
-    albedo = np.add.reduceat(bounces.albedo * share[:, None], begin[:-1], axis=0, dtype=np.float32)
-    matrices = [_all_bounces(factors, channel, n_bounces - 2) for channel in albedo.T]
-    return QuickBounces(
+    mean_albedo = np.add.reduceat(albedo * share[:, None], begin[:-1], axis=0, dtype=np.float32)
+    sent_on = np.minimum(mean_albedo, np.float32(_SENT_ON)) if lasting else mean_albedo
+    matrices = [_all_bounces(factors, channel, n_bounces - 2) for channel in sent_on.T]
+    quick = QuickBounces(
         rows.indptr,
         entries,
         bits,
-        bounces.albedo,
         albedo,
+        mean_albedo,
         begin,
         share,
         _in_blocks(matrices),
-        n_bounces >= _LASTING,
+        lasting,
+        1.0,
         np.zeros((2, tree.n_leaves, 4), np.float32),
         np.zeros(tree.n_leaves, np.uint64),
     )
+    return _steady(quick) if lasting else quick
+
+
+def _steady(quick: QuickBounces) -> QuickBounces:
+    """The same with clusters that send on less, as far as errors would else grow from frame to frame."""
+    for factor in _FACTORS:
+        tried = replace(quick, sent_on=factor)
+        if _growth(tried) < _SHRINKS:
+            return tried
+    return replace(quick, sent_on=0.0)
+
+
+def _growth(quick: QuickBounces) -> float:
+    """Factor of an error in one step, once what shrinks faster is gone: of light where there should be none."""
+    n = len(quick.albedo)
+    dark, light = np.zeros((n, 3), np.float32), np.random.default_rng(0).standard_normal((n, 3), np.float32)
+    sizes = np.empty(_TRIED)
+    for step in range(_TRIED):
+        quick.follow(light, dark, dark, light, (step % 4, 4))
+        sizes[step] = np.abs(light).sum()
+    before, after = sizes[-1 - _LAST_TRIED], sizes[-1]
+    return float((after / before) ** (1 / _LAST_TRIED)) if before > 0 else 0.0
+
+
+def lasting_albedo(albedo: F32, n_bounces: int) -> F32:
+    """Albedo whose balance among surfaces of one albedo has the light of so many bounces.
+
+    ``1 / (1 - a')`` is ``1 + a + ... + a^(n - 1)``. White surfaces, which would keep light for ever, lose a little
+    at every bounce.
+    """
+    a = albedo.astype(np.float64)[..., None] ** np.arange(n_bounces)
+    return (1.0 - 1.0 / a.sum(axis=-1)).astype(np.float32)
 
 
 def _all_bounces(factors: F32, albedo: F32, n: int) -> F32:

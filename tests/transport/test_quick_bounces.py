@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numba
 import numpy as np
 import pytest
 
-from icheat_usd.transport import solve_bounces
-from icheat_usd.transport.quick_bounces import build_quick_bounces, cluster_begins
+from icheat_usd.transport import Bounces, SparseRows, solve_bounces
+from icheat_usd.transport import quick_bounces as module
+from icheat_usd.transport.quick_bounces import build_quick_bounces, cluster_begins, lasting_albedo
 from tests.pipeline import Pipeline
 from tests.scenes import cornell
 
@@ -54,11 +58,17 @@ def test_more_clusters_come_closer_to_the_light_of_the_view(room: Pipeline) -> N
     assert more < 0.6 * few < 0.3 * two_reflections
 
 
+def _balance(bounces: Bounces, direct: np.ndarray) -> np.ndarray:
+    """What 16 bounces are taken to balance at, by many plain ones."""
+    lasting = replace(bounces, albedo=lasting_albedo(bounces.albedo, 16))
+    return solve_bounces(lasting, direct[None], 200)[0]
+
+
 def test_light_that_follows_a_change_converges_on_the_exact_bounces(room: Pipeline) -> None:
     """Every step takes most of the error away, and a small change starts with a small one."""
     direct = room.cell_light.direct[0]
     before = direct * np.random.default_rng(0).uniform(0.8, 1.2, direct.shape).astype(np.float32)
-    exact, exact_before = (solve_bounces(room.bounces, light[None], 40)[0] for light in (direct, before))
+    exact, exact_before = (_balance(room.bounces, light) for light in (direct, before))
     quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=64)
 
     def error(radiance: np.ndarray) -> float:
@@ -74,7 +84,7 @@ def test_bounces_of_a_part_of_the_cells_come_as_close_within_a_round(room: Pipel
     """A look at every fourth cell leaves little more error than one at all, and less the more parts have been seen."""
     direct = room.cell_light.direct[0]
     before = direct * np.random.default_rng(0).uniform(0.8, 1.2, direct.shape).astype(np.float32)
-    exact, start = (solve_bounces(room.bounces, light[None], 40)[0] for light in (direct, before))
+    exact, start = (_balance(room.bounces, light) for light in (direct, before))
     quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=32)
     assert np.diff(quick.begin).max() > 32
 
@@ -87,6 +97,49 @@ def test_bounces_of_a_part_of_the_cells_come_as_close_within_a_round(room: Pipel
         radiance = quick.follow(radiance, direct, direct, part=(part % 4, 4))
     assert errors[0] < 1.5 * error(quick.follow(start, before, direct)) + 0.002
     assert errors[3] < 0.7 * errors[0]
+
+
+@pytest.mark.parametrize("albedo", [0.0, 0.3, 0.8, 0.99, 1.0])
+def test_a_balance_has_the_light_of_so_many_bounces(albedo: float) -> None:
+    """Between surfaces of one albedo, whose rows add up to 1."""
+    lasting = float(lasting_albedo(np.full((1, 3), albedo, np.float32), 16)[0, 0])
+    assert 1 / (1 - lasting) == pytest.approx(sum(albedo**k for k in range(16)), rel=1e-5)
+
+
+@pytest.mark.parametrize(("n_sheets", "each"), [(64, 8), (16, 16)])
+def test_errors_shrink_where_clusters_have_both_sides_of_white_sheets(
+    monkeypatch: pytest.MonkeyPatch, n_sheets: int, each: int
+) -> None:
+    """Light that moves for long stays what it would be if it had just been made."""
+    bounces, begin = _white_sheets(n_sheets, each)
+    n = len(bounces.albedo)
+    monkeypatch.setattr(module, "_clusters", lambda *_: begin)
+    quick = build_quick_bounces(bounces, SimpleNamespace(n_leaves=n, weight=np.ones(n)), 16)  # type: ignore[arg-type]
+    direct = np.zeros((n, 3), np.float32)
+    direct[: n // 4] = 1
+    radiance, before = quick.solve(direct), direct
+    for step in range(120):
+        now = direct * np.float32(1.05 if step % 2 == 0 else 1)
+        quick.follow(radiance, before, now, radiance, (step % 4, 4))
+        before = now
+    balance = _balance(bounces, direct)
+    assert np.abs(radiance - balance).sum() < 0.15 * balance.sum()
+
+
+def _white_sheets(n_sheets: int, each: int) -> tuple[Bounces, np.ndarray]:
+    """Sheets above each other, the sides of each in one cluster, and the first cell of each cluster.
+
+    So many cells of either side see all that faces them; the outer sides see themselves.
+    """
+    n = 2 * n_sheets * each
+    sheet, up = np.repeat(np.arange(n_sheets), 2 * each), np.arange(n) % 2 == 1
+    seen = sheet + np.where(up, 1, -1)
+    is_outer = (seen < 0) | (seen == n_sheets)
+    seen, other = np.clip(seen, 0, n_sheets - 1), np.where(is_outer, up, ~up)
+    indices = np.stack([np.flatnonzero((sheet == s) & (up == u)) for s, u in zip(seen, other, strict=True)])
+    weights = np.full(n * each, 1 / each, np.float32)
+    rows = SparseRows(np.arange(n + 1, dtype=np.int64) * each, indices.ravel().astype(np.int32), weights, n)
+    return Bounces(rows, np.ones((n, 3), np.float32), rows), np.arange(0, n + 1, 2 * each)
 
 
 def test_clusters_are_subtrees_that_cover_all_cells(room: Pipeline) -> None:
