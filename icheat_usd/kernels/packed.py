@@ -1,7 +1,6 @@
 """Products of quantised transport tiles with the light of gather cells.
 
-How `large_terms` wants them, which multiplies integers and leaves out small
-terms; and the plain product, `multiply_tiles`, with float32 sums.
+How `tile_product` wants them, which multiplies integers; and the plain product, `multiply_tiles`, with float32 sums.
 """
 
 from __future__ import annotations
@@ -16,28 +15,22 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.simd import (
     address_of,
     fetch,
-    load,
     load_color,
     load_int8,
     load_spread,
     multiply_add,
-    product,
-    rounded_pairs,
     scaled,
     store_color,
     store_colors,
-    store_words,
     zeros,
 )
 
 LANES = 64  # rows of a tile: four vectors of sums for each of three channels stay in registers
 PARTS = 32  #: runs of equal work: threads take equal shares of the parts, one behind the other
-_LARGEST_WORD = 32767.0
-_LARGEST_SUM = 2.0**31 / 128 * (1 - 1e-3)  # of the sizes of a tile's words: no sum with quanta overflows 32 bits
 
 
 class PairedTiles(NamedTuple):
-    """Quantised tiles as `multiply_terms` reads them: quanta of every two successive coefficients side by side."""
+    """Quantised tiles as `multiply_tile` reads them: quanta of every two successive coefficients side by side."""
 
     tile_begin: NDArray[np.int64]  #: (n_tiles + 1,) even numbers
     index: NDArray[np.int32]  #: (n,)
@@ -107,24 +100,6 @@ def _multiply_one(begin, end, value, colors, out):  # type: ignore[no-untyped-de
     store_colors(place + 256, r1, g1, b1)
     store_colors(place + 512, r2, g2, b2)
     store_colors(place + 768, r3, g3, b3)
-
-
-@kernel
-def choose_steps(n, bounds, steps, per_step):  # type: ignore[no-untyped-def]
-    """Units (4,) of the words of each channel, and four times their inverse, for `n` coefficients."""
-    for i in range(16):
-        c = i % 4
-        steps[c] = max(bounds[0, c] / _LARGEST_WORD, bounds[1, c] / (_LARGEST_SUM - n))
-        per_step[i] = 1.0 / steps[c] if steps[c] > 0.0 else 0.0
-
-
-@kernel
-def round_pairs(n, even, odd, per_step, pairs):  # type: ignore[no-untyped-def]
-    """`n` pairs of colours in steps, as int16; whole vectors, so up to three pairs more."""
-    factor = load(address_of(per_step))
-    for offset in range(0, 16 * n, 64):
-        a, b = load(address_of(even) + offset), load(address_of(odd) + offset)
-        store_words(address_of(pairs) + offset, rounded_pairs(product(a, factor), product(b, factor)))
 
 
 @kernel

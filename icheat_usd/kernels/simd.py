@@ -291,6 +291,12 @@ def load_one(builder: Any, values: Any) -> Any:
 
 
 @_operation(types.int64, types.int64)
+def load_number(builder: Any, values: Any) -> Any:
+    """The int32 at an address."""
+    return builder.sext(builder.load(_at(builder, values[0], _I32), align=4), ir.IntType(64))
+
+
+@_operation(types.int64, types.int64)
 def load_byte(builder: Any, values: Any) -> Any:
     """A whole number of 8 bits, from 0 up, from an address."""
     return builder.zext(builder.load(_at(builder, values[0], _I8)), ir.IntType(64))
@@ -338,6 +344,12 @@ def scale_add(builder: Any, values: Any) -> Any:
 def color_add(builder: Any, values: Any) -> Any:
     """``a * b + c`` channel by channel, rounded once where the machine can."""
     return _call(builder, "llvm.fmuladd.v4f32", _F4X, *values)
+
+
+@_operation(floats, color)
+def four_times(builder: Any, values: Any) -> Any:
+    """A colour four times."""
+    return _picked(builder, values[0], values[0], [0, 1, 2, 3] * 4)
 
 
 _IN_FIVES = [0] * 5 + [1] * 5 + [2] * 5 + [3]  #: lanes: five of each channel, and the pad

@@ -171,9 +171,11 @@ def with_movable_lights(parts: Parts) -> tuple[Parts, list[str]]:
     camera = parts.snapshot.camera.to_world
     radius = parts.snapshot.radius
     if not np.isin(kinds, [int(kind) for kind in AREA_KINDS]).any():
-        # At the camera, which stands in free space and looks along -Z as rectangles shine.
+        # Half way to what is seen, as the camera looks along -Z and rectangles shine: at the camera a wall may be next.
         size = (0.1 * radius, 0.1 * radius)
-        added.append(TestLight("addedArea", LightKind.RECT, camera, (5.0, 5.0, 5.0), size))
+        to_world = np.array(camera, np.float64)
+        to_world[:, 3] -= 0.5 * float(np.median(parts.view.depth)) * to_world[:, 2]
+        added.append(TestLight("addedArea", LightKind.RECT, to_world, (5.0, 5.0, 5.0), size))
     if not (kinds == int(LightKind.DOME)).any():
         flat = np.full((16, 32, 3), 0.3, np.float32)
         flat[:6, :8] = 2.0

@@ -1,0 +1,176 @@
+"""Some terms of one quantised tile times one version of the light, as integers.
+
+Light is rounded to 16 bits and products are summed exactly, some hundred terms at a time. There are thousands of tiles
+in a frame, of which many have a dozen terms: all is handed on as addresses, as arrays would cost more than these.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from icheat_usd.kernels._jit import kernel
+from icheat_usd.kernels.packed import LANES
+from icheat_usd.kernels.simd import (
+    add_dot,
+    as_floats,
+    black,
+    channel,
+    color_of,
+    fetch,
+    four_times,
+    larger_size,
+    load,
+    load_color,
+    load_number,
+    load_one,
+    no_sum,
+    plus,
+    plus_size,
+    product,
+    ratios,
+    rounded_pairs,
+    scaled,
+    spread_pair,
+    store,
+    store_color,
+    store_colors,
+    store_words,
+    widen,
+    zeros,
+)
+
+QUANTA = 2 * LANES  #: bytes of a pair of coefficients
+PRODUCT = 16 * LANES  #: bytes of a product
+_AT_ONCE = 128  # pairs of coefficients: their quanta are in the second-level cache before they are multiplied
+_COLORS = 16 * (_AT_ONCE + 4)  # bytes of a colour for each, and what is beyond the last as vectors are whole
+_SUMS = 12 * 64  # bytes
+_WORD_STEPS = 1.0 / 32767.0
+_LARGEST_SUM = 2.0**31 / 128 * (1 - 1e-3)  # of the sizes of a tile's words: no sum with quanta overflows 32 bits
+
+
+@kernel
+def new_room() -> np.ndarray:
+    """Work space of `multiply_tile`, which whoever has it must mention behind the last product, or Numba frees it."""
+    return np.empty((3 * _COLORS + _SUMS) // 4, np.float32)
+
+
+@kernel
+def _scale_pairs(
+    number: int, n: int, index: int, scale: int, value: int, coefficients: int, even: int, odd: int
+) -> tuple[Any, Any]:
+    """Colours that the quanta of `n` pairs multiply, every second one apart; their largest sizes, and sums of sizes.
+
+    Meanwhile the quanta come into the cache.
+    """
+    largest_even = largest_odd = sum_even = sum_odd = black()
+    for _ in range(n):
+        pair = load_number(number)
+        ahead = value + QUANTA * pair
+        fetch(ahead)
+        fetch(ahead + 64)
+        where, size = index + 8 * pair, scale + 8 * pair
+        a = scaled(load_color(coefficients + 16 * load_number(where)), load_one(size))
+        b = scaled(load_color(coefficients + 16 * load_number(where + 4)), load_one(size + 4))
+        store_color(even, a)
+        store_color(odd, b)
+        largest_even, sum_even = larger_size(largest_even, a), plus_size(sum_even, a)
+        largest_odd, sum_odd = larger_size(largest_odd, b), plus_size(sum_odd, b)
+        number += 4
+        even += 16
+        odd += 16
+    return larger_size(largest_even, largest_odd), plus_size(sum_even, sum_odd)
+
+
+@kernel
+def _round_pairs(n: int, even: int, odd: int, per_step: Any, words: int) -> None:
+    """`n` pairs of colours in steps, as int16; whole vectors, so up to three pairs more."""
+    factor = four_times(per_step)
+    for offset in range(0, 16 * n, 64):
+        a, b = load(even + offset), load(odd + offset)
+        store_words(words + offset, rounded_pairs(product(a, factor), product(b, factor)))
+
+
+@kernel
+def _add(place: int, sums: Any, step: float) -> None:
+    store(place, plus(load(place), as_floats(sums, step)))
+
+
+@kernel
+def _multiply_pairs(
+    number: int, n: int, value: int, words: int, step: Any, ahead: int, n_ahead: int, sums: int
+) -> None:
+    """Add `n` pairs times words to 12 vectors of sums; meanwhile pairs `ahead` come into the cache, of which is one."""
+    r0 = r1 = r2 = r3 = g0 = g1 = g2 = g3 = b0 = b1 = b2 = b3 = no_sum()
+    last = ahead + 4 * (n_ahead - 1)
+    for _ in range(n):
+        soon = value + QUANTA * load_number(ahead)
+        fetch(soon)
+        fetch(soon + 64)
+        ahead = min(ahead + 4, last)
+        quanta = value + QUANTA * load_number(number)
+        r, g, b = spread_pair(words), spread_pair(words + 4), spread_pair(words + 8)
+        x = widen(quanta)
+        r0, g0, b0 = add_dot(x, r, r0), add_dot(x, g, g0), add_dot(x, b, b0)
+        x = widen(quanta + 32)
+        r1, g1, b1 = add_dot(x, r, r1), add_dot(x, g, g1), add_dot(x, b, b1)
+        x = widen(quanta + 64)
+        r2, g2, b2 = add_dot(x, r, r2), add_dot(x, g, g2), add_dot(x, b, b2)
+        x = widen(quanta + 96)
+        r3, g3, b3 = add_dot(x, r, r3), add_dot(x, g, g3), add_dot(x, b, b3)
+        words += 16
+        number += 4
+    r, g, b = channel(step, 0), channel(step, 1), channel(step, 2)
+    _add(sums, r0, r)
+    _add(sums + 64, r1, r)
+    _add(sums + 128, r2, r)
+    _add(sums + 192, r3, r)
+    _add(sums + 256, g0, g)
+    _add(sums + 320, g1, g)
+    _add(sums + 384, g2, g)
+    _add(sums + 448, g3, g)
+    _add(sums + 512, b0, b)
+    _add(sums + 576, b1, b)
+    _add(sums + 640, b2, b)
+    _add(sums + 704, b3, b)
+
+
+@kernel
+def multiply_tile(
+    number: int, n: int, following: int, n_following: int, index: int, scale: int, value: int, coefficients: int,
+    room: int, out: int,
+) -> None:  # fmt: skip
+    """Some pairs of coefficients of one tile times one version.
+
+    Parameters
+    ----------
+    number, n : address of int32 numbers of the pairs, and how many they are
+    following, n_following
+        The same of the next product, whose quanta come into the cache meanwhile; there may be none.
+    index, scale, value : addresses of the first pair's in `packed.PairedTiles`
+    coefficients : address of float32 colours and a pad each
+    room : address of a `new_room`
+    out : address of (64, 4) float32, set
+    """
+    even, odd, words, sums = room, room + _COLORS, room + 2 * _COLORS, room + 3 * _COLORS
+    for k in range(12):
+        store(sums + 64 * k, zeros())
+    one = color_of(np.float32(1.0), np.float32(1.0), np.float32(1.0))
+    while n > 0:
+        some, rest = min(n, _AT_ONCE), n - min(n, _AT_ONCE)
+        end = number + 4 * some
+        largest, total = _scale_pairs(number, some, index, scale, value, coefficients, even, odd)
+        most = np.float32(1.0 / (_LARGEST_SUM - 2.0 * some))
+        step = larger_size(scaled(largest, np.float32(_WORD_STEPS)), scaled(total, most))
+        _round_pairs(some, even, odd, ratios(one, step), words)
+        if rest > 0:
+            ahead, n_ahead = end, min(rest, _AT_ONCE)
+        elif n_following > 0:
+            ahead, n_ahead = following, n_following
+        else:
+            ahead, n_ahead = number, some
+        _multiply_pairs(number, some, value, words, step, ahead, n_ahead, sums)
+        number, n = end, rest
+    for k in range(4):
+        store_colors(out + 256 * k, load(sums + 64 * k), load(sums + 256 + 64 * k), load(sums + 512 + 64 * k))
