@@ -154,6 +154,8 @@ def test_what_is_declared_to_be_used_is_all_that_is_used(name: str) -> None:
         ("scale", {"gain": float("nan")}, "parameter 'gain'"),
         ("scale", {"gain": -1.0}, "at least 0.0"),
         ("scale", {"gain": True}, "parameter 'gain'"),
+        ("scale", {"gain": 1e19}, "expected no size above 1e\\+18"),
+        ("scale", {"color": (1.0, -1e19, 1.0)}, "expected no size above 1e\\+18"),
         ("scale", {"color": (1.0, 1.0)}, "parameter 'color'"),
         ("gamma", {"pivot": 0.0}, "parameter 'pivot'"),
         ("gamma", {"exponent": -1.0}, "parameter 'exponent'"),
@@ -175,6 +177,14 @@ def test_wrong_parameters_are_named(operation: str, given: dict[str, Value], com
     with pytest.raises(EditError, match=complaint) as error:
         operations.find(operation).complete(given, "/World/Edits/warm")
     assert str(error.value).startswith("/World/Edits/warm: ")
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_largest_parameters_leave_light_finite() -> None:
+    largest = {"gain": 1e18, "color": (1e18, 1.0, 0.0)}
+    parameters = operations.find("scale").complete(largest, "/World/Edits/warm")
+    found = operations.find("scale").constants(parameters)
+    assert found is not None and np.isfinite(found.scale * np.float32(100)).all()
 
 
 def test_a_second_operation_of_the_same_name_is_refused() -> None:

@@ -12,8 +12,8 @@ from icheat_usd.edits.model import Value
 from icheat_usd.errors import EditError
 from icheat_usd.scene import F32
 
-#: No parameter exceeds what 32-bit floats hold, in which USD keeps it and light is computed.
-_LARGEST = 3.4e38
+#: No parameter is larger: a product of two, such as a gain and a colour, times light is what 32-bit floats hold.
+_LARGEST = 1e18
 
 
 class Level(StrEnum):
@@ -207,11 +207,13 @@ def _checked(value: Value, parameter: Parameter, where: str) -> Value:
         fits = isinstance(value, type(expected))
     else:
         fits = isinstance(value, tuple) == isinstance(expected, tuple) and all(
-            isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= _LARGEST for x in components
+            isinstance(x, (int, float)) and not isinstance(x, bool) for x in components
         )
         fits = fits and (not isinstance(expected, tuple) or parameter.is_array or len(components) == len(expected))
     if not fits:
         raise EditError(f"{where}: parameter '{parameter.name}' is {value!r}, expected something like {expected!r}")
+    if any(isinstance(x, (int, float)) and not abs(x) <= _LARGEST for x in components):
+        raise EditError(f"{where}: parameter '{parameter.name}' is {value!r}, expected no size above {_LARGEST:g}")
     if parameter.minimum is not None and any(float(x) < parameter.minimum for x in components):
         raise EditError(f"{where}: parameter '{parameter.name}' is {value!r}, expected at least {parameter.minimum}")
     if parameter.choices and value not in parameter.choices:
