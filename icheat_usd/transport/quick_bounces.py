@@ -61,7 +61,7 @@ class QuickBounces:
     share: F32  #: (n_gather,) of the cell in its cluster's area
     blocks: NDArray[np.uint16]  #: later bounces, between clusters, per colour; see `kernels.reach_clusters`
     lasting: bool  #: whether there are enough bounces for a balance
-    sent_on: float  #: factor of later bounces, less than 1 where errors would grow
+    sent_on: float  #: factor of later bounces while light follows changes, less than 1 where errors would grow
     scratch: F32  #: (2, n_gather, 4) for `solve` and `follow`, which thus serve one thread at a time
     short: NDArray[np.uint64]  #: (n_gather,) as well, for light that rows reach
 
@@ -71,10 +71,11 @@ class QuickBounces:
         none = np.empty((0, 3), np.float32)
         leaves, _ = self._take_change(none, none, direct)
         if not self.lasting:  # one bounce is what light without any lacks
-            self._step(direct, _ALL, out)
+            self._step(direct, _ALL, 1.0, out)
             return out
-        self._add(leaves, None, _ALL, none)
-        return self._balance(direct, _ALL, out)
+        # Nothing grows in so few steps.
+        self._add(leaves, None, _ALL, 1.0, none)
+        return self._balance(direct, _ALL, 1.0, out)
 
     def follow(
         self, radiance: F32, before: F32, direct: F32, out: F32 | None = None, part: tuple[int, int] = (0, 1)
@@ -95,12 +96,12 @@ class QuickBounces:
         leaves, (changed, all_of_it) = self._take_change(radiance, before, direct)
         if changed > all_of_it:
             return self.solve(direct, out)
-        self._add(leaves, None, _ALL, np.empty((0, 3), np.float32))
-        return self._balance(direct, part, out)
+        self._add(leaves, None, _ALL, self.sent_on, np.empty((0, 3), np.float32))
+        return self._balance(direct, part, self.sent_on, out)
 
-    def _balance(self, direct: F32, part: tuple[int, int], out: F32) -> F32:
+    def _balance(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32) -> F32:
         for _ in range(_STEPS):
-            lacking, light = self._step(direct, part, out)
+            lacking, light = self._step(direct, part, sent_on, out)
             if lacking <= _UNBALANCED * light:
                 break
             part = _ALL if lacking > _FAR * light else ((part[0] + part[1] // 2) % part[1], part[1])
@@ -114,7 +115,7 @@ class QuickBounces:
         )
         return leaves, sizes.sum(axis=0)
 
-    def _step(self, direct: F32, part: tuple[int, int], out: F32) -> F32:
+    def _step(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32) -> F32:
         """Add what is missing; sizes of it and of the light, before."""
         light, missing = self.scratch
         leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 2), np.float32)
@@ -136,14 +137,14 @@ class QuickBounces:
             leaves,
             sizes,
         )
-        self._add(leaves, arriving, part, out)
+        self._add(leaves, arriving, part, sent_on, out)
         return np.asarray(sizes.sum(axis=0))
 
-    def _add(self, leaves: F32, here: F32 | None, part: tuple[int, int], out: F32) -> None:
+    def _add(self, leaves: F32, here: F32 | None, part: tuple[int, int], sent_on: float, out: F32) -> None:
         """Add the later bounces of light that leaves clusters; and what is missing, which arrives as `here` says."""
         later = np.empty((self.n_clusters, 3), np.float32)
         take_back()
-        kernels.reach_clusters(self.blocks, leaves * np.float32(self.sent_on), later)
+        kernels.reach_clusters(self.blocks, leaves * np.float32(sent_on), later)
         light, missing = self.scratch
         here, missing = (later, missing[:0]) if here is None else (here, missing)
         kernels.add_missing(self.begin, self.albedo, missing, here, later, *part, light, self.short, out)
