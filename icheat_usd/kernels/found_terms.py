@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.packed import PARTS, PairedTiles, share
 from icheat_usd.kernels.simd import address_of, fetch
-from icheat_usd.kernels.tile_product import PRODUCT, QUANTA, multiply_tile, new_room
+from icheat_usd.kernels.tile_product import QUANTA, multiply_tile, new_room, tables_of
 
 _FEW = 24  # numbers that are sorted by inserting each
 _AHEAD = 64  # pairs whose quanta are on their way to the cache while the product before them is made
@@ -204,22 +204,16 @@ def multiply_found(  # type: ignore[no-untyped-def]
     """
     n = len(job_version)
     cost_end = found_begin[1:] + _COST * np.arange(1, n + 1)
-    tables = address_of(index), address_of(scale), address_of(value)
-    light, target = address_of(coefficients), address_of(out)
-    step = 16 * coefficients.shape[1]
     for turn in prange(PARTS):
         part = 2 * turn % PARTS + 2 * turn // PARTS
         first, last = share(cost_end, part), share(cost_end, part + 1)
-        room = new_room()
-        numbers, work = address_of(found), address_of(room)
+        room, tables, numbers = new_room(), tables_of(index, scale, value, coefficients, out), address_of(found)
         if first < last:
             next_count = _prepare(found[found_begin[first] : found_begin[first + 1]], value)
         for job in range(first, last):
             count = next_count
             if job + 1 < last:
                 next_count = _prepare(found[found_begin[job + 1] : found_begin[job + 2]], value)
-            multiply_tile(
-                numbers + 4 * found_begin[job], count, numbers, 0, *tables, light + step * np.int64(job_version[job]),
-                work, target + PRODUCT * np.int64(job_out[job]),
-            )  # fmt: skip
+            number = numbers + 4 * found_begin[job]
+            multiply_tile(tables, job_version[job], job_out[job], number, count, number, 0, address_of(room))
         room[0] = np.float32(0)  # keeps it

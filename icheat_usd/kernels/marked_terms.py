@@ -12,7 +12,7 @@ from numba import prange
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.packed import PARTS, share, sum_costs
 from icheat_usd.kernels.simd import address_of, load_word, lowest_bit, set_byte
-from icheat_usd.kernels.tile_product import PRODUCT, multiply_tile, new_room
+from icheat_usd.kernels.tile_product import multiply_tile, new_room, tables_of
 
 WORD = 8  #: marks that are looked at together
 _RUNS = 64  # of coefficients: a thread takes one at a time
@@ -75,21 +75,16 @@ def _multiply_run(  # type: ignore[no-untyped-def]
     for job in range(first, last):
         most = max(most, tile_begin[job_tile[job] + 1] - tile_begin[job_tile[job]])
     rooms, room = np.empty((2, most // 2), np.int32), new_room()
-    tables = address_of(index), address_of(scale), address_of(value)
-    light, target = address_of(coefficients), address_of(out)
-    step, n_following = 16 * coefficients.shape[1], 0
+    tables, n_following = tables_of(index, scale, value, coefficients, out), 0
     for job in range(first, last + 1):
         n, n_following = n_following, 0
         if job < last:
             begin, end = tile_begin[job_tile[job]] >> 1, tile_begin[job_tile[job] + 1] >> 1
             n_following = _find_marked(begin, end, marks[job_marks[job]], rooms[job % 2])
         if job > first:
-            number, following = address_of(rooms[(job - 1) % 2]), address_of(rooms[job % 2])
-            version, to = np.int64(job_version[job - 1]), np.int64(job_out[job - 1])
-            multiply_tile(
-                number, n, following, n_following, *tables, light + step * version, address_of(room),
-                target + PRODUCT * to,
-            )  # fmt: skip
+            made, number, following = job - 1, address_of(rooms[(job - 1) % 2]), address_of(rooms[job % 2])
+            work = tables, job_version[made], job_out[made], number, n, following, n_following, address_of(room)
+            multiply_tile(*work)
     room[0] = np.float32(0)  # keeps it
 
 

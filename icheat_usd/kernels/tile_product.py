@@ -6,7 +6,7 @@ in a frame, of which many have a dozen terms: all is handed on as addresses, as 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from icheat_usd.kernels._jit import kernel
 from icheat_usd.kernels.packed import LANES
 from icheat_usd.kernels.simd import (
     add_dot,
+    address_of,
     as_floats,
     black,
     channel,
@@ -42,12 +43,38 @@ from icheat_usd.kernels.simd import (
 )
 
 QUANTA = 2 * LANES  #: bytes of a pair of coefficients
-PRODUCT = 16 * LANES  #: bytes of a product
+_PRODUCT = 16 * LANES  # bytes of a product
 _AT_ONCE = 128  # pairs of coefficients: their quanta are in the second-level cache before they are multiplied
 _COLORS = 16 * (_AT_ONCE + 4)  # bytes of a colour for each, and what is beyond the last as vectors are whole
 _SUMS = 12 * 64  # bytes
 _WORD_STEPS = 1.0 / 32767.0
 _LARGEST_SUM = 2.0**31 / 128 * (1 - 1e-3)  # of the sizes of a tile's words: no sum with quanta overflows 32 bits
+
+
+class Tables(NamedTuple):
+    """Addresses of what products are made of, and where they go."""
+
+    index: int  #: of the columns of `packed.PairedTiles`
+    scale: int
+    value: int
+    light: int  #: of (n_versions, m, 4) float32 coefficients
+    light_step: int  #: bytes of a version
+    out: int  #: of (n_out, 64, 4) float32
+
+
+@kernel
+def tables_of(
+    index: np.ndarray, scale: np.ndarray, value: np.ndarray, coefficients: np.ndarray, out: np.ndarray
+) -> Tables:
+    """Tables of arrays, which outlive them."""
+    return Tables(
+        address_of(index),
+        address_of(scale),
+        address_of(value),
+        address_of(coefficients),
+        16 * coefficients.shape[1],
+        address_of(out),
+    )
 
 
 @kernel
@@ -57,9 +84,7 @@ def new_room() -> np.ndarray:
 
 
 @kernel
-def _scale_pairs(
-    number: int, n: int, index: int, scale: int, value: int, coefficients: int, even: int, odd: int
-) -> tuple[Any, Any]:
+def _scale_pairs(number: int, n: int, tables: Tables, coefficients: int, even: int, odd: int) -> tuple[Any, Any]:
     """Colours that the quanta of `n` pairs multiply, every second one apart; their largest sizes, and sums of sizes.
 
     Meanwhile the quanta come into the cache.
@@ -67,10 +92,10 @@ def _scale_pairs(
     largest_even = largest_odd = sum_even = sum_odd = black()
     for _ in range(n):
         pair = load_number(number)
-        ahead = value + QUANTA * pair
+        ahead = tables.value + QUANTA * pair
         fetch(ahead)
         fetch(ahead + 64)
-        where, size = index + 8 * pair, scale + 8 * pair
+        where, size = tables.index + 8 * pair, tables.scale + 8 * pair
         a = scaled(load_color(coefficients + 16 * load_number(where)), load_one(size))
         b = scaled(load_color(coefficients + 16 * load_number(where + 4)), load_one(size + 4))
         store_color(even, a)
@@ -138,21 +163,19 @@ def _multiply_pairs(
 
 @kernel
 def multiply_tile(
-    number: int, n: int, following: int, n_following: int, index: int, scale: int, value: int, coefficients: int,
-    room: int, out: int,
-) -> None:  # fmt: skip
+    tables: Tables, version: int, to: int, number: int, n: int, following: int, n_following: int, room: int
+) -> None:
     """Some pairs of coefficients of one tile times one version.
 
     Parameters
     ----------
+    version, to : number of the light, and of the product
     number, n : address of int32 numbers of the pairs, and how many they are
     following, n_following
         The same of the next product, whose quanta come into the cache meanwhile; there may be none.
-    index, scale, value : addresses of the first pair's in `packed.PairedTiles`
-    coefficients : address of float32 colours and a pad each
     room : address of a `new_room`
-    out : address of (64, 4) float32, set
     """
+    coefficients, out = tables.light + tables.light_step * np.int64(version), tables.out + _PRODUCT * np.int64(to)
     even, odd, words, sums = room, room + _COLORS, room + 2 * _COLORS, room + 3 * _COLORS
     for k in range(12):
         store(sums + 64 * k, zeros())
@@ -160,7 +183,7 @@ def multiply_tile(
     while n > 0:
         some, rest = min(n, _AT_ONCE), n - min(n, _AT_ONCE)
         end = number + 4 * some
-        largest, total = _scale_pairs(number, some, index, scale, value, coefficients, even, odd)
+        largest, total = _scale_pairs(number, some, tables, coefficients, even, odd)
         most = np.float32(1.0 / (_LARGEST_SUM - 2.0 * some))
         step = larger_size(scaled(largest, np.float32(_WORD_STEPS)), scaled(total, most))
         _round_pairs(some, even, odd, ratios(one, step), words)
@@ -170,7 +193,7 @@ def multiply_tile(
             ahead, n_ahead = following, n_following
         else:
             ahead, n_ahead = number, some
-        _multiply_pairs(number, some, value, words, step, ahead, n_ahead, sums)
+        _multiply_pairs(number, some, tables.value, words, step, ahead, n_ahead, sums)
         number, n = end, rest
     for k in range(4):
         store_colors(out + 256 * k, load(sums + 64 * k), load(sums + 256 + 64 * k), load(sums + 512 + 64 * k))
