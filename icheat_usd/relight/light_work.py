@@ -43,7 +43,7 @@ from icheat_usd.tracing import Tracer
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.transport import Bounces
 from icheat_usd.transport.bounces import bounce_by_bounce
-from icheat_usd.transport.quick_bounces import QuickBounces, build_quick_bounces
+from icheat_usd.transport.quick_bounces import PARTS, QuickBounces, build_quick_bounces
 from icheat_usd.transport.sparse import SparseRows
 
 # Smoother lobes are found by rays of their own at rest: points of the light miss them.
@@ -54,8 +54,6 @@ _RAYS_PER_STEP = 1 << 16  # of the general way
 # Places nearer to a light than so many of its extents are lit by what samples solid angles: of points spread evenly
 # over a light, those next to a place are too few and too bright.
 _NEAR = 1.0
-
-_PARTS = 4  # bounces of a light that moves are found for one of so many cells at a time
 
 # Rays to the sky of each patch point and view sample, for domes on the move.
 _SKY_OF_CELLS, _SKY_OF_VIEW = 16, 8
@@ -297,7 +295,7 @@ class Following:
     def next_part(self) -> tuple[int, int]:
         """Of the cells, whose bounces are looked at this time; all of them at first."""
         self.n += 1
-        return (0, 1) if self.n == 1 else (self.n % _PARTS, _PARTS)
+        return (0, 1) if self.n == 1 else (self.n % PARTS, PARTS)
 
 
 class MovingLight:

@@ -29,6 +29,9 @@ _LASTING = 12
 # have cells on both sides of such a surface, what they add for these is wrong and sent on as well.
 _SENT_ON = 0.8
 
+#: Bounces of a light that moves are found for one of so many cells at a time.
+PARTS = 4
+
 # An error that is left alone must shrink: over the last of so many steps, to less than this of itself in each.
 _TRIED, _LAST_TRIED = 16, 6
 _SHRINKS = 0.85
@@ -44,10 +47,10 @@ class QuickBounces:
     """Bounce rows of few rays in a word per entry, and the mean rows of clusters of neighbouring cells.
 
     Light `g` after all bounces balances ``g = d + A R g`` (d direct light, A albedo, R rows); see `lasting_albedo`
-    for those that are not all. A step adds what
-    is missing, ``r = d + A R g - g`` with the exact rows, and what becomes of `r` in further bounces between
-    clusters: an iteration with a preconditioner [1]_, which gains a factor of two to ten per step. Weights
-    are rounded by at most 0.4 % each at 65,536 cells, of either sign, and so is the light that they reach.
+    for those that are not all. A step adds what is missing, ``r = d + A R g - g`` with the exact rows, and what
+    becomes of `r` in further bounces between clusters: an iteration with a preconditioner [1]_, which gains a factor
+    of two to ten per step. Weights are rounded by at most 0.4 % each at 65,536 cells, of either sign, and so is the
+    light that they reach.
 
     .. [1] Saad 2003, Iterative Methods for Sparse Linear Systems, section 9.
     """
@@ -214,7 +217,7 @@ def _growth(quick: QuickBounces) -> float:
     dark, light = np.zeros((n, 3), np.float32), np.random.default_rng(0).standard_normal((n, 3), np.float32)
     sizes = np.empty(_TRIED)
     for step in range(_TRIED):
-        quick.follow(light, dark, dark, light, (step % 4, 4))
+        quick.follow(light, dark, dark, light, (step % PARTS, PARTS))
         sizes[step] = np.abs(light).sum()
     before, after = sizes[-1 - _LAST_TRIED], sizes[-1]
     return float((after / before) ** (1 / _LAST_TRIED)) if before > 0 else 0.0
