@@ -6,6 +6,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.outliers import looked_at_closely
 
 MOST = 12  # records that one sample is fitted with
 _STEPS = 40  # of coordinate descent
@@ -16,18 +17,19 @@ _TURN = np.float32(16.0)  # square of the pixels that a turn by a radian is as f
 
 
 @kernel
-def _see(response, gloss_of, gloss, tint, light, v, at, out):  # type: ignore[no-untyped-def]
+def _see(is_close, response, closer_of, closer, gloss_of, gloss, tint, light, v, at, out):  # type: ignore[no-untyped-def]
     """What sample `v` would show with the light at sample `at`, by set and light: (n_sets n_lights,)."""
     n_sets, n_lights = response.shape[1], response.shape[2]
+    seen = closer if is_close else response
+    row = np.int64(closer_of[at]) if is_close else np.int64(at)
     for s in range(n_sets):
         for k in range(n_lights):
-            out[s * n_lights + k] = tint[0, v] * response[at, s, k] * light[k]
+            out[s * n_lights + k] = tint[0, v] * seen[row, s, k] * light[k]
     g = gloss_of[at]
     if g >= 0:
-        for k in range(n_lights):
-            add = (tint[1, v] * gloss[g, 0, k] + tint[2, v] * gloss[g, 1, k]) * light[k]
-            for s in range(n_sets):
-                out[s * n_lights + k] += add
+        for s in range(n_sets):
+            for k in range(n_lights):
+                out[s * n_lights + k] += (tint[1, v] * gloss[g, s, 0, k] + tint[2, v] * gloss[g, s, 1, k]) * light[k]
 
 
 @kernel
@@ -43,10 +45,14 @@ def _find(  # type: ignore[no-untyped-def]
     bucket_begin,
     bucket_record,
     record_view,
+    is_close,
+    closer_of,
     n,
     record,
 ):
     """Append the nearest records on the same object to the `n` that a sample has, up to `MOST`; their number then.
+
+    `is_close`: those alone that were looked at more closely.
 
     Others may lie behind a wall: that many lights show them alike is no proof that the next one does.
     """
@@ -60,7 +66,7 @@ def _find(  # type: ignore[no-untyped-def]
             for e in range(bucket_begin[place], bucket_begin[place + 1]):
                 r = bucket_record[e]
                 w = record_view[r]
-                if instance[w] != instance[v]:
+                if instance[w] != instance[v] or (is_close and closer_of[w] < 0):
                     continue
                 cosine = normal[v, 0] * normal[w, 0] + normal[v, 1] * normal[w, 1] + normal[v, 2] * normal[w, 2]
                 if cosine < _LEAST_COSINE:
@@ -164,6 +170,8 @@ def _fit_one(  # type: ignore[no-untyped-def]
     bucket_record,
     record_view,
     response,
+    closer_of,
+    closer,
     gloss_of,
     gloss,
     tint,
@@ -176,6 +184,7 @@ def _fit_one(  # type: ignore[no-untyped-def]
 ):
     """See `fit_weights`; how many entries there are."""
     record, start = np.empty(MOST, np.int64), np.zeros(MOST)
+    is_close = looked_at_closely(v, indptr, indices, record_view, closer_of, v)
     n = 0
     for e in range(indptr[v], indptr[v + 1]):
         record[n], start[n] = indices[e], weights[e]
@@ -192,14 +201,17 @@ def _fit_one(  # type: ignore[no-untyped-def]
         bucket_begin,
         bucket_record,
         record_view,
+        is_close,
+        closer_of,
         n,
         record,
     )
     size = response.shape[1] * response.shape[2]
     want, seen = np.empty(size, np.float32), np.empty((MOST, size), np.float32)
-    _see(response, gloss_of, gloss, tint, light, v, v, want)
+    _see(is_close, response, closer_of, closer, gloss_of, gloss, tint, light, v, v, want)
     for k in range(n):
-        _see(response, gloss_of, gloss, tint, light, v, record_view[record[k]], seen[k])
+        at = record_view[record[k]]
+        _see(is_close, response, closer_of, closer, gloss_of, gloss, tint, light, v, at, seen[k])
     weight = np.empty(MOST)
     _descend(seen, want, n, start, prior, weight)
     return _thin(record, weight, n, most, least, out_record, out_weight)
@@ -222,6 +234,8 @@ def fit_weights(  # type: ignore[no-untyped-def]
     bucket_record,
     record_view,
     response,
+    closer_of,
+    closer,
     gloss_of,
     gloss,
     tint,
@@ -244,7 +258,7 @@ def fit_weights(  # type: ignore[no-untyped-def]
         As for `record_weights`.
     shape
         Height and width of the image, pixels.
-    response, gloss_of, gloss, tint
+    response, closer_of, closer, gloss_of, gloss, tint
         As for `interpolation_errors`.
     light : (n_lights,)
         Factor of each light.
@@ -276,6 +290,8 @@ def fit_weights(  # type: ignore[no-untyped-def]
                     bucket_record,
                     record_view,
                     response,
+                    closer_of,
+                    closer,
                     gloss_of,
                     gloss,
                     tint,

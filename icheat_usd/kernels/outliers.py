@@ -9,24 +9,32 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 
 
 @kernel
-def _add(response, gloss_of, gloss, tint, v, at, share, out):  # type: ignore[no-untyped-def]
-    """Add what sample `v` would show with `share` of the light at sample `at`."""
+def looked_at_closely(v, indptr, indices, record_view, closer_of, row):  # type: ignore[no-untyped-def]
+    """Whether sample `v`, and all records that interpolate it by one row of the table, were."""
+    close = closer_of[v] >= 0
+    for e in range(indptr[row], indptr[row + 1]):
+        close = close and closer_of[record_view[indices[e]]] >= 0
+    return close
+
+
+@kernel
+def _add(seen, at_seen, gloss_of, gloss, tint, v, at, share, out):  # type: ignore[no-untyped-def]
+    """Add what sample `v` would show with `share` of the light at sample `at`, which is `seen` in a row of its own."""
     n_sets, n_lights = out.shape
     for s in range(n_sets):
         for light in range(n_lights):
-            out[s, light] += share * tint[0, v] * response[at, s, light]
+            out[s, light] += share * tint[0, v] * seen[at_seen, s, light]
     g = gloss_of[at]
     if g >= 0:
-        for lobe in range(2):
-            for light in range(n_lights):
-                add = share * tint[1 + lobe, v] * gloss[g, lobe, light]
-                for s in range(n_sets):
-                    out[s, light] += add
+        for s in range(n_sets):
+            for lobe in range(2):
+                for light in range(n_lights):
+                    out[s, light] += share * tint[1 + lobe, v] * gloss[g, s, lobe, light]
 
 
 @parallel_kernel
 def interpolation_errors(  # type: ignore[no-untyped-def]
-    samples, indptr, indices, weights, record_view, response, gloss_of, gloss, tint, out
+    samples, indptr, indices, weights, record_view, response, closer_of, closer, gloss_of, gloss, tint, out
 ):
     """Interpolated less measured light of some samples.
 
@@ -39,14 +47,21 @@ def interpolation_errors(  # type: ignore[no-untyped-def]
         View sample of each record.
     response : (n_view, n_sets, n_lights)
         Diffuse, before the tint, from independent sets of rays.
+    closer_of : (n_view,)
+        Row of `closer` (n_closer, n_sets, n_lights), the same by more rays, or -1.
     gloss_of : (n_view,)
-        Row of `gloss` (n_glossy, 2 lobes, n_lights), or -1.
+        Row of `gloss` (n_glossy, n_sets, 2 lobes, n_lights), or -1.
     tint : (3, n_view)
     out : (n, n_sets, n_lights)
     """
     for q in prange(len(samples)):
         v = samples[q]
         out[q] = np.float32(0.0)
+        is_close = looked_at_closely(v, indptr, indices, record_view, closer_of, np.int64(q))
+        seen = closer if is_close else response
         for e in range(indptr[q], indptr[q + 1]):
-            _add(response, gloss_of, gloss, tint, v, record_view[indices[e]], weights[e], out[q])
-        _add(response, gloss_of, gloss, tint, v, v, np.float32(-1.0), out[q])
+            at = record_view[indices[e]]
+            at_seen = np.int64(closer_of[at]) if is_close else np.int64(at)
+            _add(seen, at_seen, gloss_of, gloss, tint, v, at, weights[e], out[q])
+        at_seen = np.int64(closer_of[v]) if is_close else np.int64(v)
+        _add(seen, at_seen, gloss_of, gloss, tint, v, v, np.float32(-1.0), out[q])

@@ -8,6 +8,7 @@ from icheat_usd.materials.bsdf import (
     evaluate,
     evaluate_specular,
     is_glossy,
+    reflectance_to_eye,
     sample_specular,
 )
 from icheat_usd.materials.surface import (
@@ -31,6 +32,7 @@ __all__ = [
     "is_glossy",
     "nonzero_rows",
     "points_on_surface",
+    "reflectance_to_eye",
     "sample_specular",
     "shade_hits",
     "take_points",

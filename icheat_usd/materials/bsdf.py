@@ -105,6 +105,24 @@ def is_glossy(points: SurfacePoints) -> Bool:
     return lobe & (points.delta == DeltaKind.NONE) & (points.instance >= 0)
 
 
+def reflectance_to_eye(points: SurfacePoints, to_eye: F32) -> F32:
+    """What a specular lobe sends to the eye of uniform light, as Schlick has it for microfacets that face as the surface.
+
+    Parameters
+    ----------
+    to_eye : (n, 3) float32, unit
+
+    Returns
+    -------
+    (n, 3) float32
+        From `specular` at normal incidence to `specular_edge` at grazing; rough surfaces come near it.
+    """
+    cosine = np.abs((points.shading_normal * to_eye).sum(axis=1, keepdims=True)).clip(0, 1)
+    edge = (1 - cosine) ** 5
+    out: F32 = (1 - edge) * points.specular + edge * points.specular_edge
+    return out
+
+
 # Cosine-weighted mean over eye directions of the lobe's directional albedo, for `specular` 1 and for
 # `specular_edge` 1: polynomials in roughness fitted to quadrature of `evaluate_specular`; largest error 0.0003.
 # A smooth surface gives Schlick's 20/21 and 1/21; a rough one loses what its microfacets hide from each other.

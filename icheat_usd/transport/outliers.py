@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,27 @@ class Survey:
 
     diffuse: F32  #: (n_view, 2, n_lights) before the tint, from two independent sets of rays
     glossy: I64  #: (n,) view samples with a reflection that matters, ascending
-    specular: F32  #: (n, 2, n_lights) the same for the specular lobes, from one set
+    specular: F32  #: (n, 2, 2, n_lights) the same for the two specular lobes, by set and lobe
+    #: (m,) view samples that were looked at with more rays, ascending
+    close: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+    #: (m, 2, n_lights) what these say of `diffuse`
+    closer: F32 = field(default_factory=lambda: np.empty((0, 2, 0), np.float32))
+
+    @cached_property
+    def closer_of(self) -> I32:
+        """Row of `closer` of each view sample, or -1: (n_view,)."""
+        return _places(self.close, len(self.diffuse))
+
+    @cached_property
+    def gloss_of(self) -> I32:
+        """Row of `specular` of each view sample, or -1: (n_view,)."""
+        return _places(self.glossy, len(self.diffuse))
+
+
+def _places(samples: I64, n: int) -> I32:
+    out = np.full(n, -1, np.int32)
+    out[samples] = np.arange(len(samples), dtype=np.int32)
+    return out
 
 
 class Scores(NamedTuple):
@@ -42,6 +63,29 @@ class Scores(NamedTuple):
     sure: F64  #: what both sets of rays say, never negative
     mean: F64  #: without noise on average
     noise: F64  #: variance of one set
+
+
+def doubtful_samples(records: Records, survey: Survey, tint: F32, share: float) -> I64:
+    """View samples of whose interpolation the survey can say least, and the records that they are made from.
+
+    Parameters
+    ----------
+    tint : (3, n_view)
+        Of the lobes, scalar.
+    share
+        Of the samples, how many are doubted.
+
+    Returns
+    -------
+    (n,) int64, ascending
+    """
+    view = records.mesh.view
+    judge = Judge(survey, tint, records, view.height, view.width, view.pixel)
+    scores = judge.scores(np.arange(view.n), records.interpolation, records.view.astype(np.int64))
+    n = int(share * view.n)
+    doubted = np.sort(np.argpartition(-scores.noise, n)[:n]) if n < view.n else np.arange(view.n)
+    used = take_rows(records.interpolation, doubted).indices
+    return np.union1d(doubted, records.view[used].astype(np.int64))
 
 
 def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSettings) -> Records:
@@ -68,6 +112,7 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
     table = records.interpolation
     everything = np.arange(view.n)
     scores = judge.scores(everything, table, mesh.record_view)
+    close = judge.is_close(everything, table, mesh.record_view)
     most = int(settings.max_share * view.n)
     noise = judge.smoothed(scores.noise) * np.where(records.fit > _ON_SHEET, _CHANCE_ON_SHEETS, _CHANCE)
     light = judge.scores(everything, SparseRows.empty(view.n, 1), np.zeros(1, np.int64)).sure
@@ -86,7 +131,9 @@ def add_outliers(records: Records, survey: Survey, tint: F32, settings: RecordSe
         touched = everything[(mesh.record >= 0) | (excess > settings.tolerance**2)]
         found = mesh.interpolate(touched)
         again = judge.scores(touched, found, mesh.record_view)
-        better = (mesh.record[touched] >= 0) | (again.sure < 0.5 * scores.sure[touched])
+        # With few rays much passes for right that more of them knew to be wrong.
+        known_as_well = judge.is_close(touched, found, mesh.record_view) | ~close[touched]
+        better = (mesh.record[touched] >= 0) | (known_as_well & (again.sure < 0.5 * scores.sure[touched]))
         table = select_rows(table, found, touched[better], np.flatnonzero(better))
         for all_of_it, part in zip(scores, again, strict=True):
             all_of_it[touched[better]] = part[better]
@@ -101,8 +148,6 @@ class Judge:
         self._survey, self._tint = survey, np.ascontiguousarray(tint, np.float32)
         self._shape, self._pixel = (height, width), pixel
         n_view = len(survey.diffuse)
-        self.gloss_of = np.full(n_view, -1, np.int64)
-        self.gloss_of[survey.glossy] = np.arange(len(survey.glossy))
         # The error of no interpolation at all is the image.
         some = np.arange(0, n_view, max(1, n_view // _CHUNK))
         one, two = self._errors(some, SparseRows.empty(len(some), 1), np.zeros(1, np.int64)).transpose(1, 0, 2)
@@ -138,12 +183,22 @@ class Judge:
             table.weights,
             record_view,
             survey.diffuse,
-            self.gloss_of,
+            survey.closer_of,
+            survey.closer,
+            survey.gloss_of,
             survey.specular,
             self._tint,
             out,
         )
         return out
+
+    def is_close(self, samples: I64, table: SparseRows, record_view: I64) -> Bool:
+        """Whether some samples, and all records that they are made from, were looked at with more rays: (n,)."""
+        found = self._survey.closer_of[samples] >= 0
+        far = self._survey.closer_of[record_view[table.indices]] < 0
+        row = np.repeat(np.arange(table.n_rows), np.diff(table.indptr))
+        found[row[far]] = False
+        return found
 
     def smoothed(self, values: F64) -> F64:
         """Mean over blocks of the image, for each sample."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from icheat_usd.errors import IcheatError
-from icheat_usd.materials import is_glossy, take_points
+from icheat_usd.materials import is_glossy, reflectance_to_eye, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, SceneSnapshot
@@ -15,7 +16,7 @@ from icheat_usd.tracing import Tracer
 from icheat_usd.transport.allotment import Counts, allot_rays
 from icheat_usd.transport.build import Lobe, Transport
 from icheat_usd.transport.fitting import fit_weights
-from icheat_usd.transport.outliers import Survey, add_outliers
+from icheat_usd.transport.outliers import Survey, add_outliers, doubtful_samples
 from icheat_usd.transport.pieces import PartStore, Pieces
 from icheat_usd.transport.rays import MOST_RAYS, MeasuredRows, RowBuilder, scatter_rows, specular_counts
 from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
@@ -25,9 +26,12 @@ from icheat_usd.transport.sparse import SparseRows, concatenate_rows, take_rows
 _PLACING_RAYS = 128
 #: The same for every view sample, when outliers are looked for.
 _SURVEY_RAYS = 64
+_DOUBTED = 0.25  # share of the samples that are surveyed with more rays: those that few rays say least of
+_CLOSER_SHARE = 4  # as few rays of a row, rounded down to a power of two, are more
+_WEAK_RAYS = 8  # of each half of these, for reflections that hardly show
 #: Numbers of the survey that are held in memory, though it has some lights at least.
 _SURVEYED_NUMBERS, _FEWEST_LIGHTS = 1 << 26, 48
-_STRONG = 0.2  # reflectance: what reflects less gets no records of its own for that
+_STRONG = 0.2  # reflectance towards the eye: what reflects less gets no records of its own for that
 _SURVEYED_AT_ONCE = 1 << 13  # samples, whose rows are held in memory
 _FIRST_RAYS = 256  # of each record by itself, by which the others are allotted
 _GROWTH = 4  # of the rays from one transport to the next
@@ -120,25 +124,34 @@ def build_transports(
         n_rays = int(counts.mean()) + 1 if len(counts) else 1
         return list(pieces.both(make, np.arange(len(samples)), n_rays, _GLOSSY_STEP))
 
+    is_strong = reflectance_to_eye(view.points, view.to_eye).max(axis=1) >= _STRONG
     n_surveyed = max(_FEWEST_LIGHTS, _SURVEYED_NUMBERS // (2 * view.n))
     survey_lights = np.ascontiguousarray(lights[:, :n_surveyed])
 
-    def look(samples: I64) -> F32:
+    def look(samples: I64, n_rays: int = _SURVEY_RAYS) -> F32:
         """Diffuse light by few rays, in two halves: (n, 2, n_lights)."""
-        stream, half = np.zeros_like(samples), _SURVEY_RAYS // 2
-        parts = [trace(samples, stream, first, half, _SURVEY_RAYS).cells.matmul(survey_lights) for first in (0, half)]
+        stream, half = np.zeros_like(samples), n_rays // 2
+        parts = [trace(samples, stream, first, half, n_rays).cells.matmul(survey_lights) for first in (0, half)]
         return np.stack(parts, axis=1)
 
+    n_closer = max(_SURVEY_RAYS, 1 << (max(1, rays_per_row // _CLOSER_SHARE).bit_length() - 1))
+
+    def look_closer(samples: I64) -> F32:
+        return look(samples, n_closer)
+
     def look_specular(samples: I64) -> F32:
-        both = trace_specular(samples, np.zeros_like(samples), _glossy_counts(view, samples, _SURVEY_RAYS))
-        return np.stack([rows.matmul(survey_lights) for rows in both], axis=1)
+        """Reflected light in two halves of the rays, before the tints: (n, 2, 2 lobes, n_lights)."""
+        counts = np.where(is_strong[samples], _SURVEY_RAYS // 2, _WEAK_RAYS)
+        halves = [trace_specular(samples, np.full_like(samples, half), counts) for half in (0, 1)]
+        return np.stack([np.stack([rows.matmul(survey_lights) for rows in lobes], axis=1) for lobes in halves], axis=1)
 
     def survey() -> Survey:
         """The light at every view sample."""
         order = _in_image_tiles(view, np.arange(view.n))
         is_found = is_glossy(view.points)
         glossy = np.flatnonzero(is_found)
-        diffuse, reflected = (np.empty((n, 2, survey_lights.shape[1]), np.float32) for n in (view.n, len(glossy)))
+        diffuse = np.empty((view.n, 2, survey_lights.shape[1]), np.float32)
+        reflected = np.empty((len(glossy), 2, 2, survey_lights.shape[1]), np.float32)
         chunks = _chunks(order)
         for some, light in zip(chunks, pieces.each(look, chunks, _DIFFUSE_STEP), strict=True):
             diffuse[some] = light
@@ -146,6 +159,14 @@ def build_transports(
         for some, light in zip(chunks, pieces.each(look_specular, chunks, _GLOSSY_STEP), strict=True):
             reflected[np.searchsorted(glossy, some)] = light
         return Survey(diffuse, glossy, reflected)
+
+    def surveyed_closer(seen: Survey, doubted: I64) -> Survey:
+        """The same, with more rays for samples that it says little of."""
+        chunks = _chunks(doubted[_in_image_tiles(view, doubted)], _SURVEYED_AT_ONCE * _SURVEY_RAYS // n_closer)
+        closer = np.empty((len(doubted), *seen.diffuse.shape[1:]), np.float32)
+        for some, light in zip(chunks, pieces.each(look_closer, chunks, _DIFFUSE_STEP), strict=True):
+            closer[np.searchsorted(doubted, some)] = light
+        return replace(seen, close=doubted, closer=closer)
 
     def probe(samples: I64) -> F32:
         order = _in_image_tiles(view, samples)
@@ -173,10 +194,11 @@ def build_transports(
     assert records is not None
     placed.clear()
     seen = survey()
-    strong = np.flatnonzero(view.points.specular[seen.glossy].max(axis=1) >= _STRONG)
-    sure = Survey(seen.diffuse, seen.glossy[strong], seen.specular[strong])
-    records = fit_weights(add_outliers(records, sure, tint, settings), seen, tint)
-    del seen, sure
+    strong = tint.copy()
+    strong[1:, ~is_strong] = 0
+    seen = surveyed_closer(seen, doubtful_samples(records, seen, strong, _DOUBTED))
+    records = fit_weights(add_outliers(records, seen, strong, settings), seen, tint)
+    del seen
 
     order, spread = _in_tiles(view, records)
     samples = records.view[order].astype(np.int64)
@@ -215,8 +237,8 @@ def _glossy_counts(view: ViewSamples, samples: I64, n_rays: int) -> I64:
     return out
 
 
-def _chunks(samples: I64) -> list[I64]:
-    return np.split(samples, range(_SURVEYED_AT_ONCE, len(samples), _SURVEYED_AT_ONCE))
+def _chunks(samples: I64, at_once: int = _SURVEYED_AT_ONCE) -> list[I64]:
+    return np.split(samples, range(at_once, len(samples), at_once))
 
 
 def _in_image_tiles(view: ViewSamples, samples: I64) -> I64:

@@ -16,6 +16,7 @@ from icheat_usd.materials import (
     evaluate_specular,
     is_glossy,
     points_on_surface,
+    reflectance_to_eye,
     sample_specular,
 )
 from icheat_usd.scene import SurfacePoints
@@ -102,6 +103,16 @@ def test_sampling_gives_the_albedo_that_quadrature_of_the_lobe_gives(roughness: 
     np.testing.assert_allclose(weight_base.mean(dtype=float), base, rtol=3e-3)
     np.testing.assert_allclose(weight_edge.mean(dtype=float), edge, rtol=1e-2, atol=2e-4)
     assert weight_base.max() <= 1 and weight_base.mean() + weight_edge.mean() <= 1
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.8, 1.4])
+def test_a_smooth_lobe_reflects_what_its_reflectance_to_the_eye_says(angle: float) -> None:
+    n = 4096
+    u = np.random.default_rng(2).random((n, 2), np.float32)
+    points, eye = points_of(Material(0.5, roughness=0.1, ior=1.5), n), many(at_angle(angle), n)
+    _, base, edge = sample_specular(points, eye, u)
+    sampled = points.specular[0, 0] * base.mean() + points.specular_edge[0, 0] * edge.mean()
+    assert reflectance_to_eye(points, eye)[0, 0] == pytest.approx(sampled, rel=0.02)
 
 
 @pytest.mark.parametrize("roughness", [0.4, 0.9])

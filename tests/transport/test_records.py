@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from icheat_usd.tracing import build_tracer
 from icheat_usd.transport import Transport, build_bounces
 from icheat_usd.transport.allotment import allot_rays
 from icheat_usd.transport.fitting import fit_weights
-from icheat_usd.transport.outliers import Survey, add_outliers
+from icheat_usd.transport.outliers import Survey, add_outliers, doubtful_samples
 from icheat_usd.transport.progressive import build_transports
 from icheat_usd.transport.rays import RowBuilder
 from icheat_usd.transport.records import Records, RecordSettings, place_records, tile_order
@@ -29,6 +31,16 @@ def floor_scene(width: int = 48, height: int = 36) -> SceneSnapshot:
     block = Mesh(box((0.3, 0.6, 0.3)), transforms=[translation(0.2, 0.3, 0.3)], path="/block")
     camera = look_at((0.4, 1.2, 2.0), (0, 0.1, 0), fov=40, width=width, height=height)
     return make_snapshot([Mesh(quad(3), path="/floor"), block], camera=camera)
+
+
+def diffuse_survey(halves: F32) -> Survey:
+    """Of samples that reflect nothing specularly: (n_view, 2, n_lights)."""
+    return Survey(halves, np.empty(0, np.int64), np.empty((0, 2, 2, halves.shape[2]), np.float32))
+
+
+def white(view: ViewSamples) -> F32:
+    """Tint of diffuse samples."""
+    return np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
 
 
 def place(scene: SceneSnapshot, response: F32, view: ViewSamples, **settings: float) -> list[Records]:
@@ -267,8 +279,8 @@ def test_fitted_weights_find_the_records_that_see_the_same() -> None:
     lights = [np.where(stripe, 1 + 0.2 * np.sin(k * x + z), 0.1 + 0.5 * k + 0.1 * np.cos(k * z)) for k in range(6)]
     light = np.stack(lights, axis=1).astype(np.float32)
     records = place(scene, light, view, coarsest=4, tolerance=1.0, max_share=0.3)[0]
-    survey = Survey(np.stack([light, light], axis=1), np.empty(0, np.int64), np.empty((0, 2, 6), np.float32))
-    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    survey = diffuse_survey(np.stack([light, light], axis=1))
+    tint = white(view)
     found = fit_weights(records, survey, tint)
 
     def error(records: Records) -> float:
@@ -294,8 +306,8 @@ def test_fitted_weights_take_no_light_from_another_object() -> None:
     lights = [1 + 0.8 * np.cos(k + 3 * stripe + view.points.position[:, 2]) for k in range(6)]
     light = np.stack(lights, axis=1).astype(np.float32)
     records = place(scene, light, view, coarsest=4, tolerance=1.0, max_share=0.3)[0]
-    survey = Survey(np.stack([light, light], axis=1), np.empty(0, np.int64), np.empty((0, 2, 6), np.float32))
-    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    survey = diffuse_survey(np.stack([light, light], axis=1))
+    tint = white(view)
     found = fit_weights(records, survey, tint)
     on_shelf = (view.points.instance == 1).astype(np.float32)[:, None]
     leaked = found.interpolation.matmul(on_shelf[found.view])[:, 0] - on_shelf[:, 0]
@@ -310,8 +322,8 @@ def test_a_thin_bright_bar_gets_records_of_its_own() -> None:
     column = view.pixel % view.width
     light = np.where(column == 21, 4.0, 0.3 + 0.2 * view.points.position[:, 0])[:, None].astype(np.float32)
     records = place(scene, light, view, coarsest=16, tolerance=0.01, max_share=0.1)[0]
-    survey = Survey(np.stack([light, light], axis=1), np.empty(0, np.int64), np.empty((0, 2, 1), np.float32))
-    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    survey = diffuse_survey(np.stack([light, light], axis=1))
+    tint = white(view)
     found = add_outliers(records, survey, tint, RecordSettings(tolerance=0.01, max_share=0.1))
 
     def error(records: Records) -> float:
@@ -331,8 +343,8 @@ def test_creases_have_records_for_lights_that_nobody_knew() -> None:
     view = view_of(scene)
     known = np.ones((view.n, 1), np.float32)
     records = place(scene, known, view, coarsest=16)[-1]
-    survey = Survey(np.stack([known, known], axis=1), np.empty(0, np.int64), np.empty((0, 2, 1), np.float32))
-    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    survey = diffuse_survey(np.stack([known, known], axis=1))
+    tint = white(view)
     found = add_outliers(records, survey, tint, RecordSettings(tolerance=0.001))
     in_crease = np.flatnonzero(records.mesh.corners < 0.5)
     new = found.view[len(records.view) :]
@@ -350,16 +362,15 @@ def test_outliers_leave_noise_alone_and_keep_to_the_share() -> None:
     scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
     view = view_of(scene)
     rng = np.random.default_rng(0)
-    tint = np.stack([np.ones(view.n), np.zeros(view.n), np.zeros(view.n)]).astype(np.float32)
+    tint = white(view)
     flat = np.ones((view.n, 8), np.float32)
     records = place(scene, flat, view, coarsest=16)[-1]
     start = len(records.view)
     noisy = (flat[:, None] + 0.05 * rng.standard_normal((view.n, 2, 8))).astype(np.float32)
-    none = np.empty(0, np.int64), np.empty((0, 2, 8), np.float32)
-    quiet = add_outliers(records, Survey(noisy, *none), tint, RecordSettings(tolerance=0.02))
+    quiet = add_outliers(records, diffuse_survey(noisy), tint, RecordSettings(tolerance=0.02))
     assert len(quiet.view) == start
     rough = np.repeat(rng.random((view.n, 1, 8)).astype(np.float32), 2, axis=1)
-    full = add_outliers(records, Survey(rough, *none), tint, RecordSettings(max_share=0.2))
+    full = add_outliers(records, diffuse_survey(rough), tint, RecordSettings(max_share=0.2))
     assert 0.19 * view.n < len(full.view) <= 0.2 * view.n
 
 
@@ -370,6 +381,78 @@ def test_a_mirror_among_rough_samples_gets_its_own_reflection() -> None:
     records = place(scene, flat[:, 0], view, coarsest=16)[-1]
     glossy = np.setdiff1d(np.arange(300, 304), records.view)
     tint = np.ones((3, view.n), np.float32)
-    survey = Survey(flat, glossy, np.full((len(glossy), 2, 1), 5, np.float32))
+    survey = Survey(flat, glossy, np.full((len(glossy), 2, 2, 1), 5, np.float32))
     found = add_outliers(records, survey, tint, RecordSettings(max_share=0.5))
     assert np.isin(glossy, found.view).all()
+
+
+def test_more_rays_find_what_few_leave_in_noise() -> None:
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
+    view = view_of(scene)
+    rng = np.random.default_rng(3)
+    bar = view.pixel % view.width == 21
+    light = np.repeat(np.where(bar, 1.4, 1.0)[:, None], 8, axis=1).astype(np.float32)
+    noise = np.where(bar, 1.5, 0.1)[:, None, None] * rng.standard_normal((view.n, 2, 8))
+    few = diffuse_survey((light[:, None] + noise).astype(np.float32))
+    records = place(scene, np.ones_like(light), view, coarsest=8)[-1]
+    doubted = doubtful_samples(records, few, white(view), 0.1)
+    assert np.isin(np.flatnonzero(bar & (records.mesh.record < 0)), doubted).all()
+    settings = RecordSettings(tolerance=0.02, max_share=0.2)
+    more = replace(few, close=doubted, closer=np.stack([light, light], axis=1)[doubted])
+    again = place(scene, np.ones_like(light), view, coarsest=8)[-1]
+
+    def error(records: Records) -> float:
+        wrong = records.interpolation.matmul(light[records.view]) - light
+        return float(np.sqrt(np.mean(wrong**2)))
+
+    by_more = error(add_outliers(records, more, white(view), settings))
+    by_few = error(add_outliers(again, few, white(view), settings))
+    assert by_more < 0.02 and by_few > 2 * by_more, (by_more, by_few)
+
+
+def test_what_many_rays_know_is_not_given_up_for_what_few_say() -> None:
+    # Few rays show two neighbours alike and bright, of which the one by many rays is not.
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
+    view = view_of(scene)
+    seen = np.ones((view.n, 1), np.float32)
+    records = place(scene, seen, view, coarsest=8)[-1]
+    one = np.arange(20, 40, 5) * view.width + 21
+    other = one + 1
+    assert view.n == view.width * view.height and (records.mesh.record[[one, other]] < 0).all()
+    seen[[one, other]] = 9
+    few = diffuse_survey(np.stack([seen, seen], axis=1))
+    used = [records.interpolation.indices[slice(*records.interpolation.indptr[k : k + 2])] for k in one]
+    close = np.union1d(one, records.view[np.concatenate(used)])
+    known = np.where(np.isin(close, one), 5, 1).astype(np.float32)
+    many = replace(few, close=close, closer=np.repeat(known, 2).reshape(-1, 2, 1))
+    found = add_outliers(records, many, white(view), RecordSettings(tolerance=1e-3, max_share=0.2))
+    assert np.isin([one, other], found.view).all()
+
+
+def test_weights_are_fitted_to_what_more_rays_saw() -> None:
+    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
+    view = view_of(scene)
+    x, z = view.points.position[:, 0], view.points.position[:, 2]
+    stripe = view.pixel % view.width // 3 % 2 == 0
+    lights = [np.where(stripe, 1 + 0.2 * np.sin(k * x + z), 0.1 + 0.5 * k + 0.1 * np.cos(k * z)) for k in range(6)]
+    light = np.stack(lights, axis=1).astype(np.float32)
+    records = place(scene, light, view, coarsest=4, tolerance=1.0, max_share=0.3)[0]
+    noise = 0.8 * np.random.default_rng(1).standard_normal((view.n, 2, 6))
+    few = diffuse_survey((light[:, None] + noise).astype(np.float32))
+    close = doubtful_samples(records, few, white(view), 0.5)
+    many = replace(few, close=close, closer=np.stack([light, light], axis=1)[close])
+    doubted = np.setdiff1d(close, records.view)
+
+    def error(records: Records) -> float:
+        wrong = (records.interpolation.matmul(light[records.view]) - light)[doubted]
+        return float(np.sqrt(np.mean(wrong**2)))
+
+    by_many, by_few = (fit_weights(records, survey, white(view)) for survey in (many, few))
+    assert error(by_many) < 0.5 * error(by_few)
+    # Those that few rays alone saw take no part, but where they did before.
+    table, given = by_many.interpolation, records.interpolation
+    unknown = ~np.isin(by_many.view, close)
+    for sample in doubted:
+        found = table.indices[table.indptr[sample] : table.indptr[sample + 1]]
+        before = given.indices[given.indptr[sample] : given.indptr[sample + 1]]
+        assert not np.setdiff1d(found[unknown[found]], before).size

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.materials import is_glossy, take_points
 from icheat_usd.progress import silent
 from icheat_usd.samples import GatherSamples, ViewSamples
+from icheat_usd.samples.wavelets import haar_forward, haar_inverse
 from icheat_usd.scene import F32, I64, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport import Lobe, SparseRows, Transport
+from icheat_usd.transport.packed import LANES, PackedRows, PackedTransport
 from icheat_usd.transport.rays import RowBuilder
+from icheat_usd.transport.sparse import take_rows
 
 _RAYS_AT_ONCE = 512 * 16_384  # bounds memory: a row holds up to as many entries as rays
 
@@ -96,13 +98,16 @@ def converged_transport(
     view: ViewSamples,
     n_rays: int,
     seed: int,
+    stream: I64 | None = None,
 ) -> Transport:
     """Rows of their own for every sample of `view`, uncompressed.
 
+    `stream`, (view.n,), numbers the sequences of rays: equal numbers are equal rays.
     Memory: 8 bytes for each of at most `n_rays` entries a row and lobe.
     """
     builder = RowBuilder(snapshot, tracer, gather, seed)
-    stream = np.arange(view.n, dtype=np.int64)
+    number = np.arange(view.n, dtype=np.int64)
+    stream = number if stream is None else stream
     one_each = np.arange(view.n + 1, dtype=np.int64)
     diffuse = builder.diffuse_rows(view.points, one_each, stream, n_rays, 0, silent, "")
     lobes = [Lobe("diffuse", diffuse, view.points.albedo)]
@@ -111,7 +116,7 @@ def converged_transport(
         base, edge = builder.specular_rows(view.points, view.to_eye, stream, glossy, n_rays, silent)
         lobes.append(Lobe("specular_base", base, view.points.specular))
         lobes.append(Lobe("specular_edge", edge, view.points.specular_edge))
-    return Transport(tuple(lobes), stream.astype(np.int32), None, n_rays, seed)
+    return Transport(tuple(lobes), number.astype(np.int32), None, n_rays, seed)
 
 
 def converged_products(
@@ -143,31 +148,98 @@ def converged_products(
     return out
 
 
-class InterpolationReference(NamedTuple):
-    """What interpolation makes of converged rows at the records that the samples of a probe need."""
+def lossy_errors(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    gather: GatherSamples,
+    view: ViewSamples,
+    packed: PackedTransport,
+    samples: I64,
+    n_rays: int,
+    seeds: tuple[int, int],
+    radiance: F32,
+) -> tuple[F32, F32]:
+    """Light that interpolation, and both that and packing, give some view samples, less that of rows of their own.
 
-    records: I64  #: rows of the transport
-    weights: SparseRows  #: (m x n_records)
+    All rows have many rays, so that the noise of the transport's own is not in what is lost: the records' stand in
+    the terms that packing kept of these, and what rounding did to those is added. A sample and the records that it is
+    made from have the same rays: where they see the same, what is noise still is in both, and not in the difference.
+    Every sample has other rays.
 
-    def to_samples(self, products: list[F32], tints: list[F32]) -> F32:
-        """Indirect light of the samples from products at the records, one array per lobe."""
-        total = np.zeros((self.weights.n_rows, 3), np.float32)
-        for product, tint in zip(products, tints, strict=True):
-            total += tint * self.weights.matmul(product)
-        return total
+    Parameters
+    ----------
+    packed
+        With the transport that it was made from.
+    n_rays
+        Per row and lobe.
+    seeds
+        Of two independent estimates.
+    radiance : (n_lights, n_gather, 3) float32
+
+    Returns
+    -------
+    (2, n_lights, len(samples), 3) float32 each
+        By estimate.
+    """
+    transport = packed.source
+    assert transport is not None and transport.interpolation is not None
+    n_lights = len(radiance)
+    b = np.ascontiguousarray(radiance.transpose(1, 0, 2).reshape(-1, 3 * n_lights))
+    kept = {
+        lobe.name: _KeptTerms(lobe.rows, exact.rows, b)
+        for lobe, exact in zip(packed.lobes, transport.lobes, strict=True)
+        if lobe.rows.index.size
+    }
+    out = np.zeros((2, 2, len(samples), 3 * n_lights), np.float32)
+    at_once = max(1, _RAYS_AT_ONCE // (8 * n_rays))
+    for first in range(0, len(samples), at_once):
+        some = samples[first : first + at_once]
+        own, here = np.arange(len(some)), slice(first, first + len(some))
+        used = take_rows(transport.interpolation, some)
+        record, n = used.indices.astype(np.int64), len(used.indices)
+        spread = SparseRows(used.indptr, np.arange(n, dtype=np.int32), used.weights, n)
+        seen = view_of(view, np.concatenate([some, transport.row_view[record].astype(np.int64)]))
+        stream = first + np.concatenate([own, np.repeat(own, np.diff(used.indptr))])
+        both = [
+            {
+                lobe.name: lobe
+                for lobe in converged_transport(snapshot, tracer, gather, seen, n_rays, seed, stream).lobes
+            }
+            for seed in seeds
+        ]
+        for name, terms in kept.items():
+            lobes = [lobes[name] for lobes in both if name in lobes]
+            packed_products = terms.products(record, [lobe.rows.rows(len(some), len(some) + n) for lobe in lobes])
+            for half, (lobe, at_records) in enumerate(zip(lobes, packed_products, strict=True)):
+                exact = lobe.rows.matmul(b)
+                tint = np.tile(lobe.tint[: len(some)], (1, n_lights))
+                for kind, products in enumerate((np.ascontiguousarray(exact[len(some) :]), at_records)):
+                    out[kind, half, here] += tint * (spread.matmul(products) - exact[: len(some)])
+    interpolated, with_packing = out.reshape(2, 2, len(samples), n_lights, 3).transpose(0, 1, 3, 2, 4)
+    return interpolated, with_packing
 
 
-def records_of(interpolation: SparseRows, samples: I64) -> InterpolationReference:
-    """The records that some view samples are interpolated from."""
-    begin, end = interpolation.indptr[samples], interpolation.indptr[samples + 1]
-    place = np.concatenate([np.arange(b, e) for b, e in zip(begin.tolist(), end.tolist(), strict=True)] or [[]])
-    place = place.astype(np.int64)
-    records, column = np.unique(interpolation.indices[place], return_inverse=True)
-    indptr = np.concatenate([[0], np.cumsum(end - begin)]).astype(np.int64)
-    weights = SparseRows(indptr, column.astype(np.int32), interpolation.weights[place], len(records))
-    return InterpolationReference(records.astype(np.int64), weights)
+class _KeptTerms:
+    """Products of other rows in the terms that a lobe keeps of its own."""
 
+    def __init__(self, packed: PackedRows, exact: SparseRows, b: F32) -> None:
+        self._packed, self._exact = packed, exact
+        self._coefficients = haar_forward(packed.tree, b)
+        self._products = packed.matmul(b)
 
-def points_with_eye(view: ViewSamples, transport: Transport, records: I64) -> ViewSamples:
-    """The view samples at which records stand."""
-    return view_of(view, transport.row_view[records].astype(np.int64))
+    def products(self, record: I64, versions: list[SparseRows]) -> list[F32]:
+        """Of versions of the rows of some records, each (len(record), k), with what rounding adds to the lobe's own."""
+        n = self._coefficients.shape[1]
+        out = [np.zeros((len(record), n), np.float32) for _ in versions]
+        tile = record // LANES
+        for number in np.unique(tile).tolist():
+            begin, end = self._packed.tile_begin[number : number + 2]
+            which = np.flatnonzero(tile == number)
+            seen = np.zeros_like(self._coefficients)
+            index = self._packed.index[begin:end]
+            seen[index] = self._coefficients[index]
+            b = haar_inverse(self._packed.tree, seen).astype(np.float32)
+            rounding = self._products[record[which]] - take_rows(self._exact, record[which]).matmul(b)
+            for rows, products in zip(versions, out, strict=True):
+                products[which] = take_rows(rows, which).matmul(b) + rounding
+        return out

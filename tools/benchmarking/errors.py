@@ -25,8 +25,7 @@ from tools.benchmarking.converged import (
     choose_pixels,
     converged_products,
     converged_transport,
-    points_with_eye,
-    records_of,
+    lossy_errors,
     view_of,
 )
 from tools.benchmarking.error_images import write_error_image, write_sheet, write_signed_image
@@ -43,8 +42,8 @@ class ErrorSettings:
 
     pixels: int = 2000  #: one out of each block of the image
     rays: int = 16_384  #: per pixel and lobe, each of two halves
-    record_pixels: int = 500  #: of these pixels, for the part of interpolation
-    record_rays: int = 2048  #: per record, each of two halves
+    record_pixels: int = 2000  #: of these pixels, for the part of interpolation
+    record_rays: int = 2048  #: per pixel and record, each of two halves
     edit_pixels: int = 500
     hit_pixels: int = 200  #: for the comparison with light at true hits
     hit_rays: int = 1024
@@ -87,7 +86,7 @@ def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -
         image = references.probe.to_pixels(parts.packed.to_view(just_made[light])[references.probe.samples])
         moving = relative_error(image, references.own_b[0][light], references.own_b[1][light])
         found["lights"][name]["while_moving"] = moving.as_dict()
-    for name, error in _interpolation(parts, references, settings, names):
+    for name, error in _lossy(parts, references, settings, names):
         found["lights"][name] |= error
     found["edits"] = _of_edits(parts, references, settings)
     found["curve"] = _curve(parts, references, settings)
@@ -153,60 +152,24 @@ def _difference(image: F32, exact: F32, references: References, light: int) -> R
     return relative_error_of_halves(a + change, b + change, a, b)
 
 
-def _interpolation(
+def _lossy(
     parts: Parts, references: References, settings: ErrorSettings, names: list[str]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """What interpolation alone loses, and with packing: rows at the records as converged as those at the pixels."""
-    transport = parts.transport
-    if transport.interpolation is None:
+    if parts.transport.interpolation is None:
         return
     probe = references.probe.part(settings.record_pixels, settings.seed)
     kept = np.flatnonzero(np.isin(references.probe.pixel, probe.pixel))
-    needed = records_of(transport.interpolation, probe.samples)
-    own = parts.lights.radiance
-    here = take_points(parts.view.points, probe.samples)
-    halves = []
-    for half in (3, 4):
-        at = points_with_eye(parts.view, transport, needed.records)
-        # Tints belong to the samples, so products at the records are wanted without those of the records.
-        lobes = _lobe_products(parts, at, settings.record_rays, settings.seed + 1000 * half, own)
-        tints = [here.albedo, here.specular, here.specular_edge]
-        halves.append(
-            [
-                probe.to_pixels(needed.to_samples([products[light] for products in lobes], tints[: len(lobes)]))
-                for light in range(len(own))
-            ]
-        )
+    own, seeds = parts.lights.radiance, (settings.seed + 3000, settings.seed + 4000)
+    scene = parts.snapshot, parts.tracer, parts.gather, parts.view
+    losses = lossy_errors(*scene, parts.packed, probe.samples, settings.record_rays, seeds, own)
     for light, name in enumerate(names):
         a, b = references.same_b[0][light][kept], references.same_b[1][light][kept]
-        packed, exact = (
-            probe.to_pixels(operator.to_view(own[light])[probe.samples]) for operator in (parts.packed, transport)
-        )
-        lost = packed - exact
-        yield (
-            name,
-            {
-                "interpolation": relative_error_of_halves(halves[0][light], halves[1][light], a, b).as_dict(),
-                "interpolation_and_packing": relative_error_of_halves(
-                    halves[0][light] + lost, halves[1][light] + lost, a, b
-                ).as_dict(),
-            },
-        )
-
-
-def _lobe_products(parts: Parts, view: Any, n_rays: int, seed: int, radiance: F32) -> list[F32]:
-    """Products of converged rows with every light's radiance, lobe by lobe: (n_lights, n, 3) each."""
-    n_lobes = len(parts.transport.lobes)
-    out = [np.zeros((len(radiance), view.n, 3), np.float32) for _ in range(n_lobes)]
-    for first in range(0, view.n, 512):
-        part = np.arange(first, min(first + 512, view.n))
-        rows = converged_transport(
-            parts.snapshot, parts.tracer, parts.gather, view_of(view, part), n_rays, seed + 7919 * (1 + first)
-        )
-        for lobe, into in zip(rows.lobes, out, strict=False):
-            for light, b in enumerate(radiance):
-                into[light, part] = lobe.rows.matmul(b)
-    return out
+        found = {}
+        for kind, off in zip(("interpolation", "interpolation_and_packing"), losses, strict=True):
+            one, two = (probe.to_pixels(half) for half in off[:, light])
+            found[kind] = relative_error_of_halves(a + one, b + two, a, b).as_dict()
+        yield name, found
 
 
 def _curve(parts: Parts, references: References, settings: ErrorSettings) -> list[dict[str, Any]]:
