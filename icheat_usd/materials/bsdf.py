@@ -106,7 +106,7 @@ def is_glossy(points: SurfacePoints) -> Bool:
 
 
 def reflectance_to_eye(points: SurfacePoints, to_eye: F32) -> F32:
-    """What a specular lobe sends to the eye of uniform light, as Schlick has it for microfacets that face as the surface.
+    """What a smooth specular lobe sends to the eye of uniform light: Schlick's term at the angle of the eye.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def reflectance_to_eye(points: SurfacePoints, to_eye: F32) -> F32:
     Returns
     -------
     (n, 3) float32
-        From `specular` at normal incidence to `specular_edge` at grazing; rough surfaces come near it.
+        From `specular` at normal incidence to `specular_edge` at grazing.
     """
     cosine = np.abs((points.shading_normal * to_eye).sum(axis=1, keepdims=True)).clip(0, 1)
     edge = (1 - cosine) ** 5

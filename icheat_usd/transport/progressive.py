@@ -134,7 +134,7 @@ def build_transports(
         parts = [trace(samples, stream, first, half, n_rays).cells.matmul(survey_lights) for first in (0, half)]
         return np.stack(parts, axis=1)
 
-    n_closer = max(_SURVEY_RAYS, 1 << (max(1, rays_per_row // _CLOSER_SHARE).bit_length() - 1))
+    n_closer = 1 << max(1, rays_per_row // _CLOSER_SHARE).bit_length() - 1
 
     def look_closer(samples: I64) -> F32:
         return look(samples, n_closer)
@@ -196,7 +196,8 @@ def build_transports(
     seen = survey()
     strong = tint.copy()
     strong[1:, ~is_strong] = 0
-    seen = surveyed_closer(seen, doubtful_samples(records, seen, strong, _DOUBTED))
+    if n_closer > _SURVEY_RAYS:
+        seen = surveyed_closer(seen, doubtful_samples(records, seen, strong, _DOUBTED))
     records = fit_weights(add_outliers(records, seen, strong, settings), seen, tint)
     del seen
 
