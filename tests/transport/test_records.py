@@ -271,7 +271,8 @@ def test_placement_has_the_same_bits_for_any_number_of_threads() -> None:
         assert np.array_equal(getattr(one.interpolation, name), getattr(two.interpolation, name))
 
 
-def test_fitted_weights_find_the_records_that_see_the_same() -> None:
+def stripes() -> tuple[ViewSamples, F32, Records]:
+    """A floor that six lights meet in two ways, three pixels wide each, by turns; and records that know neither."""
     scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
     view = view_of(scene)
     x, z = view.points.position[:, 0], view.points.position[:, 2]
@@ -279,6 +280,11 @@ def test_fitted_weights_find_the_records_that_see_the_same() -> None:
     lights = [np.where(stripe, 1 + 0.2 * np.sin(k * x + z), 0.1 + 0.5 * k + 0.1 * np.cos(k * z)) for k in range(6)]
     light = np.stack(lights, axis=1).astype(np.float32)
     records = place(scene, light, view, coarsest=4, tolerance=1.0, max_share=0.3)[0]
+    return view, light, records
+
+
+def test_fitted_weights_find_the_records_that_see_the_same() -> None:
+    view, light, records = stripes()
     survey = diffuse_survey(np.stack([light, light], axis=1))
     tint = white(view)
     found = fit_weights(records, survey, tint)
@@ -430,13 +436,7 @@ def test_what_many_rays_know_is_not_given_up_for_what_few_say() -> None:
 
 
 def test_weights_are_fitted_to_what_more_rays_saw() -> None:
-    scene = make_snapshot([Mesh(quad(8))], camera=look_at((0, 3, 0.01), width=64, height=64))
-    view = view_of(scene)
-    x, z = view.points.position[:, 0], view.points.position[:, 2]
-    stripe = view.pixel % view.width // 3 % 2 == 0
-    lights = [np.where(stripe, 1 + 0.2 * np.sin(k * x + z), 0.1 + 0.5 * k + 0.1 * np.cos(k * z)) for k in range(6)]
-    light = np.stack(lights, axis=1).astype(np.float32)
-    records = place(scene, light, view, coarsest=4, tolerance=1.0, max_share=0.3)[0]
+    view, light, records = stripes()
     noise = 0.8 * np.random.default_rng(1).standard_normal((view.n, 2, 6))
     few = diffuse_survey((light[:, None] + noise).astype(np.float32))
     close = doubtful_samples(records, few, white(view), 0.5)
