@@ -6,7 +6,6 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.outliers import looked_at_closely
 
 MOST = 12  # records that one sample is fitted with
 _STEPS = 40  # of coordinate descent
@@ -170,6 +169,7 @@ def _fit_one(  # type: ignore[no-untyped-def]
     bucket_record,
     record_view,
     response,
+    is_close,
     closer_of,
     closer,
     gloss_of,
@@ -184,7 +184,6 @@ def _fit_one(  # type: ignore[no-untyped-def]
 ):
     """See `fit_weights`; how many entries there are."""
     record, start = np.empty(MOST, np.int64), np.zeros(MOST)
-    is_close = looked_at_closely(v, indptr, indices, record_view, closer_of, v)
     n = 0
     for e in range(indptr[v], indptr[v + 1]):
         record[n], start[n] = indices[e], weights[e]
@@ -234,6 +233,7 @@ def fit_weights(  # type: ignore[no-untyped-def]
     bucket_record,
     record_view,
     response,
+    is_close,
     closer_of,
     closer,
     gloss_of,
@@ -258,7 +258,7 @@ def fit_weights(  # type: ignore[no-untyped-def]
         As for `record_weights`.
     shape
         Height and width of the image, pixels.
-    response, closer_of, closer, gloss_of, gloss, tint
+    response, is_close, closer_of, closer, gloss_of, gloss, tint
         As for `interpolation_errors`.
     light : (n_lights,)
         Factor of each light.
@@ -290,6 +290,7 @@ def fit_weights(  # type: ignore[no-untyped-def]
                     bucket_record,
                     record_view,
                     response,
+                    is_close[q],
                     closer_of,
                     closer,
                     gloss_of,

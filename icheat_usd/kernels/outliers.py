@@ -9,15 +9,6 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 
 
 @kernel
-def looked_at_closely(v, indptr, indices, record_view, closer_of, row):  # type: ignore[no-untyped-def]
-    """Whether sample `v`, and all records that interpolate it by one row of the table, were."""
-    close = closer_of[v] >= 0
-    for e in range(indptr[row], indptr[row + 1]):
-        close = close and closer_of[record_view[indices[e]]] >= 0
-    return close
-
-
-@kernel
 def _add(seen, at_seen, gloss_of, gloss, tint, v, at, share, out):  # type: ignore[no-untyped-def]
     """Add what sample `v` would show with `share` of the light at sample `at`, which is `seen` in a row of its own."""
     n_sets, n_lights = out.shape
@@ -34,7 +25,7 @@ def _add(seen, at_seen, gloss_of, gloss, tint, v, at, share, out):  # type: igno
 
 @parallel_kernel
 def interpolation_errors(  # type: ignore[no-untyped-def]
-    samples, indptr, indices, weights, record_view, response, closer_of, closer, gloss_of, gloss, tint, out
+    samples, indptr, indices, weights, record_view, response, is_close, closer_of, closer, gloss_of, gloss, tint, out
 ):
     """Interpolated less measured light of some samples.
 
@@ -47,6 +38,8 @@ def interpolation_errors(  # type: ignore[no-untyped-def]
         View sample of each record.
     response : (n_view, n_sets, n_lights)
         Diffuse, before the tint, from independent sets of rays.
+    is_close : (n,) bool
+        Samples that are judged by `closer`; they and their records must be there.
     closer_of : (n_view,)
         Row of `closer` (n_closer, n_sets, n_lights), the same by more rays, or -1.
     gloss_of : (n_view,)
@@ -57,11 +50,10 @@ def interpolation_errors(  # type: ignore[no-untyped-def]
     for q in prange(len(samples)):
         v = samples[q]
         out[q] = np.float32(0.0)
-        is_close = looked_at_closely(v, indptr, indices, record_view, closer_of, np.int64(q))
-        seen = closer if is_close else response
+        seen = closer if is_close[q] else response
         for e in range(indptr[q], indptr[q + 1]):
             at = record_view[indices[e]]
-            at_seen = np.int64(closer_of[at]) if is_close else np.int64(at)
+            at_seen = np.int64(closer_of[at]) if is_close[q] else np.int64(at)
             _add(seen, at_seen, gloss_of, gloss, tint, v, at, weights[e], out[q])
-        at_seen = np.int64(closer_of[v]) if is_close else np.int64(v)
+        at_seen = np.int64(closer_of[v]) if is_close[q] else np.int64(v)
         _add(seen, at_seen, gloss_of, gloss, tint, v, v, np.float32(-1.0), out[q])

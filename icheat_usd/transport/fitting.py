@@ -11,7 +11,7 @@ from icheat_usd.kernels.rows import pack_rows
 from icheat_usd.scene import F32
 from icheat_usd.transport.outliers import Judge, Survey
 from icheat_usd.transport.records import BUCKET, Records
-from icheat_usd.transport.sparse import SparseRows, select_rows
+from icheat_usd.transport.sparse import SparseRows, select_rows, take_rows
 
 _WORTH_IT = 1e-3  # squared relative error from which a sample's weights are fitted
 _PRIOR = 0.1  # how strongly they stay near the given ones
@@ -64,6 +64,7 @@ def fit_weights(records: Records, survey: Survey, tint: F32) -> Records:
         bucket_record,
         mesh.record_view,
         survey.diffuse,
+        judge.is_close(some, take_rows(table, some), mesh.record_view),
         survey.closer_of,
         survey.closer,
         survey.gloss_of,

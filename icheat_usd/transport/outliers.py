@@ -183,6 +183,7 @@ class Judge:
             table.weights,
             record_view,
             survey.diffuse,
+            self.is_close(samples, table, record_view),
             survey.closer_of,
             survey.closer,
             survey.gloss_of,

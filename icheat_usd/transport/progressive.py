@@ -26,9 +26,9 @@ from icheat_usd.transport.sparse import SparseRows, concatenate_rows, take_rows
 _PLACING_RAYS = 128
 #: The same for every view sample, when outliers are looked for.
 _SURVEY_RAYS = 64
+_WEAK_RAYS = 8  # in each half of the survey, for reflections that hardly show
 _DOUBTED = 0.25  # share of the samples that are surveyed with more rays: those that few rays say least of
-_CLOSER_SHARE = 4  # as few rays of a row, rounded down to a power of two, are more
-_WEAK_RAYS = 8  # of each half of these, for reflections that hardly show
+_CLOSER_SHARE = 4  # of a row's rays, one in so many is traced for these, rounded down to a power of two
 #: Numbers of the survey that are held in memory, though it has some lights at least.
 _SURVEYED_NUMBERS, _FEWEST_LIGHTS = 1 << 26, 48
 _STRONG = 0.2  # reflectance towards the eye: what reflects less gets no records of its own for that
