@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.materials import take_points
+from icheat_usd.materials import reflectance_to_eye, take_points
 from icheat_usd.progress import silent
 from icheat_usd.samples import ViewSamples, view_samples
 from icheat_usd.scene import F32, F64, I64, SceneSnapshot
@@ -456,3 +456,29 @@ def test_weights_are_fitted_to_what_more_rays_saw() -> None:
         found = table.indices[table.indptr[sample] : table.indptr[sample + 1]]
         before = given.indices[given.indptr[sample] : given.indptr[sample + 1]]
         assert not np.setdiff1d(found[unknown[found]], before).size
+
+
+def test_what_reflects_at_grazing_angles_alone_has_records_for_its_reflection() -> None:
+    # A dielectric floor that mirrors one bright post among dark ones; it reflects 4 % where it is looked at from above.
+    floor = Mesh(quad(6), Material(0.05, roughness=0.15, ior=1.5), path="/floor")
+    posts = [
+        Mesh(box((0.15, 1.5, 0.15)), Material(0.8), transforms=[translation(x, 0.75, -2)], path=f"/post{k}")
+        for k, x in enumerate(np.linspace(-2, 2, 7))
+    ]
+    camera = look_at((0, 0.35, 3), (0, 0.1, -2), fov=45, width=64, height=48)
+    parts = Pipeline(make_snapshot([floor, *posts], camera=camera), n_gather=512, rays=4096)
+    scene = parts.snapshot, parts.tracer
+    bounces = build_bounces(*scene, parts.gather, rays_per_row=32)
+    training = training_radiance(*scene, parts.gather, bounces, 24)
+    settings = RecordSettings(tolerance=0.01, max_share=0.6, coarsest=16)
+    found = build_transports(*scene, parts.view, parts.gather, training, settings=settings, rays_per_row=1024)
+    last = list(found)[-1]
+    points = parts.view.points
+    mirrors = points.instance == 0
+    mirrors &= reflectance_to_eye(points, parts.view.to_eye).max(axis=1) >= 0.2
+    light = np.where(parts.gather.points.instance == 4, 1.02, 0.02).astype(np.float32)
+    light = np.repeat(light[:, None], 3, axis=1)
+    exact = parts.transport.to_view(light)[mirrors]
+    wrong = last.to_view(light)[mirrors] - exact
+    assert mirrors.sum() > 500 and len(last.row_view) < 0.6 * parts.view.n
+    assert np.sqrt(np.mean(wrong**2) / np.mean(exact**2)) < 0.05
