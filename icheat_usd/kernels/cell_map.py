@@ -30,7 +30,8 @@ class CellTable(NamedTuple):
     """Entries are a sample, or ``-1 - first`` of a list in `candidates`, or `WALK`."""
 
     place: NDArray[np.int64]  #: (n_instances,) added to a triangle's row gives its placed triangle; or `NO_FACES`
-    face: NDArray[np.int32]  #: (2 * n_placed, 3) of each side: entry, 0, 0; or first square, squares along each edge
+    #: (2 * n_placed, 4) of each side: entry, 0, 0, 0; or first square, squares along two edges, the corner of these
+    face: NDArray[np.int32]
     square: NDArray[np.int32]  #: entries of the squares of divided sides, block by block of 4 by 4
     candidates: NDArray[np.int32]  #: lists: how many, then samples, ascending
 
@@ -40,11 +41,12 @@ class CellTable(NamedTuple):
 
 
 @kernel
-def placed_triangle(points, to_world, i, t):  # type: ignore[no-untyped-def]
-    """First corner and two edges in world space, double precision."""
-    ax, ay, az = np.float64(points[t, 0, 0]), np.float64(points[t, 0, 1]), np.float64(points[t, 0, 2])
-    ex, ey, ez = points[t, 1, 0] - ax, points[t, 1, 1] - ay, points[t, 1, 2] - az
-    fx, fy, fz = points[t, 2, 0] - ax, points[t, 2, 1] - ay, points[t, 2, 2] - az
+def placed_triangle(points, to_world, i, t, k):  # type: ignore[no-untyped-def]
+    """Corner k and the edges to the next two in world space, double precision."""
+    m, n = (k + 1) % 3, (k + 2) % 3
+    ax, ay, az = np.float64(points[t, k, 0]), np.float64(points[t, k, 1]), np.float64(points[t, k, 2])
+    ex, ey, ez = points[t, m, 0] - ax, points[t, m, 1] - ay, points[t, m, 2] - az
+    fx, fy, fz = points[t, n, 0] - ax, points[t, n, 1] - ay, points[t, n, 2] - az
     return (
         (
             to_world[i, 0, 0] * ax + to_world[i, 0, 1] * ay + to_world[i, 0, 2] * az + to_world[i, 0, 3],
@@ -114,6 +116,9 @@ def square_at(face, f, u, v):  # type: ignore[no-untyped-def]
     along_u, along_v = np.int64(face[f, 1]), np.int64(face[f, 2])
     if along_u == 0:
         return np.int64(-1)
+    if face[f, 3] != 0:
+        w = np.float32(1.0) - u - v
+        u, v = (v, w) if face[f, 3] == 1 else (w, u)
     a = min(max(np.int64(u * np.float32(along_u)), 0), along_u - 1)
     b = min(max(np.int64(v * np.float32(along_v)), 0), along_v - 1)
     block = (b >> 2) * ((along_u + 3) >> 2) + (a >> 2)  # a block of 4 by 4 entries is a line of the cache
@@ -151,7 +156,10 @@ def nearest_listed(candidates, sample, entry, detour, x, y, z, nx, ny, nz):  # t
 
 @parallel_kernel
 def divide_faces(points, to_world, locator, spacing, fineness, placed_instance, place, out):  # type: ignore[no-untyped-def]
-    """Squares along both edges of every side of the placed triangles, (2 n, 2); 0 where a side has one sample.
+    """Squares along two edges of every side of the placed triangles, and the corner where these meet.
+
+    That is the one with the shortest edges: squares at the tip of a sliver are slivers, too. There are 0 where a side
+    has one sample.
 
     Parameters
     ----------
@@ -164,29 +172,38 @@ def divide_faces(points, to_world, locator, spacing, fineness, placed_instance, 
     placed_instance : (n_placed,)
         Instance of each placed triangle.
     place : (n_instances,) int64, see `CellTable`
-    out : (2 n_placed, 2) int32
+    out : (2 n_placed, 3) int32
         Row 2 p + side.
     """
     for p in prange(len(placed_instance)):
         i = placed_instance[p]
-        _, e, f = placed_triangle(points, to_world, i, p - place[i])
+        _, e, f = placed_triangle(points, to_world, i, p - place[i], 0)
         e2 = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
         f2 = f[0] * f[0] + f[1] * f[1] + f[2] * f[2]
         ef = e[0] * f[0] + e[1] * f[1] + e[2] * f[2]
         area = np.sqrt(max(0.0, e2 * f2 - ef * ef))
+        g2 = max(0.0, e2 + f2 - 2.0 * ef)  # between the other two corners
+        corner = 0  # across from the longest edge
+        if f2 > g2 and f2 >= e2:
+            corner, e2, f2 = 1, g2, e2
+        elif e2 > g2:
+            corner, e2, f2 = 2, f2, g2
         for side in range(2):
             slot = locator.slot[2 * i + side]
             out[2 * p + side, 0] = 0
             out[2 * p + side, 1] = 0
+            out[2 * p + side, 2] = corner
             if locator.slot_begin[slot + 1] - locator.slot_begin[slot] == 1:
                 continue
             size = fineness * spacing[slot]
-            along_u, along_v = np.sqrt(e2) / size, np.sqrt(f2) / size
+            along_u, along_v = max(1.0, np.sqrt(e2) / size), max(1.0, np.sqrt(f2) / size)
             # Slivers: long edges, but few samples.
             limit = 4.0 + 4.0 * area / (size * size)
             if not along_u * along_v <= limit:
                 shrink = np.sqrt(limit / (along_u * along_v))
-                along_u, along_v = along_u * shrink, along_v * shrink
+                shorter = max(1.0, shrink * min(along_u, along_v))
+                longer = limit / shorter
+                along_u, along_v = (shorter, longer) if along_u < along_v else (longer, shorter)
             out[2 * p + side, 0] = np.int32(min(max(np.ceil(along_u), 1.0), _FINEST))
             out[2 * p + side, 1] = np.int32(min(max(np.ceil(along_v), 1.0), _FINEST))
 
@@ -328,7 +345,7 @@ def find_candidates(  # type: ignore[no-untyped-def]
             if first_u / along_u + first_v / along_v > 1.0 + 1e-3:
                 continue
             n = unit_normal(plane, side)
-            corner, e, f = placed_triangle(points, to_world, i, t)
+            corner, e, f = placed_triangle(points, to_world, i, t, divided[block_face[b], 2])
             whole = along_u == 1 and along_v == 1
             # A little larger than the block: rounding may put a place on its border into its neighbour.
             grow = 1e-3

@@ -13,7 +13,9 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.packets import (
     CELL,
     DETOUR,
+    INSTANCE,
     NOTHING,
+    TRIANGLE,
     clear_packet,
     look_up_cells,
     make_look_up,
@@ -25,11 +27,19 @@ from icheat_usd.kernels.samples import basis, cosine_direction, cosine_lobe
 
 BATCH = 4096  # rays that are put in order of direction; their buffers fit the second-level cache
 _BINS = 16  # along each axis, of directions in the order of tracing
+#: Columns of the detours that `count_hits` finds: the ray in its block, and what it met; the last three are float32.
+DETOUR_RAY, DETOUR_INSTANCE, DETOUR_TRIANGLE, DETOUR_DISTANCE, DETOUR_U, DETOUR_V, DETOUR_COLUMNS = range(7)
 
 
 def thread_count() -> int:
     """Threads that parallel kernels run on."""
     return int(get_num_threads())
+
+
+@kernel
+def block_rows(n_rays):  # type: ignore[no-untyped-def]
+    """Rows whose rays are ordered together, where each has so many."""
+    return max(1, BATCH // n_rays)
 
 
 @cast(Any, intrinsic)  # as a caller sees it: without the typing context
@@ -171,11 +181,13 @@ def count_hits(  # type: ignore[no-untyped-def]
         Zero before and after.
     count : (n_rows,) int64, out_key, out_hits : (n_rows, room) int32
         Out: number of cells met; the cells; the rays that end in each.
-    n_detours : (n_rows,) int64, detour : (n_rows, n_rays) int32
-        Out: the rays that end on triangles which do not simply reflect.
+    n_detours : (n_blocks,) int64, detour : (DETOUR_COLUMNS, n_blocks, block_rows * n_rays) int32
+        Out: the rays of each block of `block_rows` that end on triangles which do not simply reflect, in the order
+        of tracing, in which those after one another go about the same way. Rays are counted row by row.
     """
     n_rows = len(stream)
-    together = max(1, BATCH // n_rays)  # rows whose rays are ordered together
+    together = block_rows(n_rays)
+    detour_float = detour.view(np.float32)
     n_lanes = counter.shape[0]
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
     place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
@@ -192,8 +204,7 @@ def count_hits(  # type: ignore[no-untyped-def]
 
         for block in range(lane, (n_rows + together - 1) // together, n_lanes):
             row_0, row_1 = block * together, min(n_rows, (block + 1) * together)
-            for r in range(row_0, row_1):
-                n_detours[r] = 0
+            met = 0
             done = 0
             while done < n_rays:
                 m = min(n_rays - done, BATCH)
@@ -234,17 +245,24 @@ def count_hits(  # type: ignore[no-untyped-def]
                         slot_detour, locator, points, to_world, to_object, triangle_route, stack, bound, ends, at,
                     )  # fmt: skip
                     for k in range(width):
-                        key[order[first + k]] = ends[CELL, k]
+                        e = order[first + k]
+                        key[e] = ends[CELL, k]
+                        if ends[CELL, k] == DETOUR:
+                            detour[DETOUR_RAY, block, met] = e // m * n_rays + done + e % m
+                            detour[DETOUR_INSTANCE, block, met] = ends[INSTANCE, k]
+                            detour[DETOUR_TRIANGLE, block, met] = ends[TRIANGLE, k]
+                            detour_float[DETOUR_DISTANCE, block, met] = rays[8, k]
+                            detour_float[DETOUR_U, block, met] = rays[15, k]
+                            detour_float[DETOUR_V, block, met] = rays[16, k]
+                            met += 1
                 done += m
+                n_detours[block] = met
                 for r in range(row_0, row_1):
                     for k in range(m):
                         found = key[(r - row_0) * m + k]
                         if found >= 0:
                             counter[lane, found] += 1
                             mark[lane, found >> 6] |= np.uint64(1) << np.uint64(found & 63)
-                        elif found == DETOUR:
-                            detour[r, n_detours[r]] = first_ray + done - m + k
-                            n_detours[r] += 1
                     if done < n_rays:
                         continue
                     total = 0

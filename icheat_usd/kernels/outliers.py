@@ -57,3 +57,26 @@ def interpolation_errors(  # type: ignore[no-untyped-def]
             _add(seen, at_seen, gloss_of, gloss, tint, v, at, weights[e], out[q])
         at_seen = np.int64(closer_of[v]) if is_close[q] else np.int64(v)
         _add(seen, at_seen, gloss_of, gloss, tint, v, v, np.float32(-1.0), out[q])
+
+
+@parallel_kernel
+def score_errors(wrong, weight, sure, mean, noise):  # type: ignore[no-untyped-def]
+    """Squared errors of n samples by two sets of rays, summed over lights with a weight each.
+
+    Parameters
+    ----------
+    wrong : (n, 2, n_lights) float32
+        Of `interpolation_errors`.
+    weight : (n_lights,) float32
+    sure, mean, noise : (n,) float64
+        Out: the square of the lesser where both sets agree in sign; their product; half the square of their difference.
+    """
+    for q in prange(len(wrong)):
+        least, product, spread = 0.0, 0.0, 0.0
+        for light in range(len(weight)):
+            one, two, share = np.float64(wrong[q, 0, light]), np.float64(wrong[q, 1, light]), np.float64(weight[light])
+            product += share * one * two
+            spread += share * (one - two) * (one - two)
+            if one * two > 0.0:
+                least += share * min(one * one, two * two)
+        sure[q], mean[q], noise[q] = least, product, 0.5 * spread

@@ -12,7 +12,7 @@ from icheat_usd.samples.locate import DETOUR, Locator
 from icheat_usd.scene import I64, Geometry
 
 #: Size of a square in mean spacings of the samples: smaller ones have fewer candidates, but are more.
-FINENESS = 0.5
+FINENESS = 0.25
 #: Placed triangles with entries; placements with the most triangles per sample go without beyond it.
 MOST_PLACED = 3_000_000
 _BLOCKS_AT_ONCE = 8192  # 6 MB of candidates
@@ -51,7 +51,7 @@ class HitCells:
                 if self._asked < _WORTH_PER_TRIANGLE * triangles + _WORTH_PER_SAMPLE * samples:
                     place = np.full(len(geometry.instance_mesh), kernels.NO_FACES)
                     nothing = np.zeros(0, np.int32)
-                    return kernels.CellTable(place, np.zeros((0, 3), np.int32), nothing, nothing)
+                    return kernels.CellTable(place, np.zeros((0, 4), np.int32), nothing, nothing)
                 self._map = build_cell_map(geometry, self._locator)
             return self._map.table
 
@@ -66,7 +66,7 @@ def build_cell_map(geometry: Geometry, locator: Locator, *, fineness: float = FI
 
     Notes
     -----
-    About 24 bytes per placed triangle and 40 per sample.
+    About 32 bytes per placed triangle and 450 per sample.
     """
     table = locator.table
     size = np.diff(geometry.mesh_begin)[geometry.instance_mesh].astype(np.int64)
@@ -78,15 +78,16 @@ def build_cell_map(geometry: Geometry, locator: Locator, *, fineness: float = FI
     placed_instance = np.repeat(np.arange(len(size), dtype=np.int32), size)
     n_sides = 2 * len(placed_instance)
 
-    divided = np.empty((n_sides, 2), np.int32)
+    divided = np.empty((n_sides, 3), np.int32)
     spacing = np.sqrt(table.slot_detour.astype(np.float64)) / DETOUR
     kernels.divide_faces(
         geometry.points, geometry.instance_to_world, table, spacing, fineness, placed_instance, place, divided
     )
-    blocks = np.maximum(1, (-(-divided // kernels.BLOCK)).prod(axis=1, dtype=np.int64))
-    squares = np.where(divided.prod(axis=1, dtype=np.int64) > 1, kernels.BLOCK**2 * blocks, 0)
+    along = divided[:, :2]
+    blocks = np.maximum(1, (-(-along // kernels.BLOCK)).prod(axis=1, dtype=np.int64))
+    squares = np.where(along.prod(axis=1, dtype=np.int64) > 1, kernels.BLOCK**2 * blocks, 0)
     square_begin = np.concatenate([[0], np.cumsum(squares)])
-    face = np.zeros((n_sides, 3), np.int32)
+    face = np.zeros((n_sides, 4), np.int32)
     face[:, 0] = square_begin[:-1]
     face[squares > 0, 1:] = divided[squares > 0]
     square = np.full(square_begin[-1], kernels.WALK, np.int32)

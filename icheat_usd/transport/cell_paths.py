@@ -71,6 +71,7 @@ def cells_behind(
     counters: I32,
     seed: int,
     max_depth: int,
+    first: Hits | None = None,
 ) -> tuple[I32, F32]:
     """What `first_surfaces` and `GatherSamples.locate` find.
 
@@ -80,6 +81,8 @@ def cells_behind(
         Of `routed_triangles`.
     origins, directions, counters, seed, max_depth
         As of `first_surfaces`.
+    first : Hits of n rays, optional
+        Where they are known, and all may not simply reflect.
 
     Returns
     -------
@@ -93,13 +96,17 @@ def cells_behind(
     cell, throughput = np.full(n, NOTHING, np.int32), np.ones((n, 3), np.float32)
     path = np.arange(n)
     for depth in range(max_depth + 1):
-        moving = np.repeat(nonzero_rows(towards)[:, None], 3, axis=1).astype(np.float32)
-        ends, hits = first_cells(snapshot, trace, gather, route, origins, towards, moving)
-        met = np.flatnonzero(ends == DETOUR)
-        ends[met] = NOTHING
-        cell[path] = ends
-        path, towards = path[met], towards[met]
-        points = shade_hits(snapshot, Hits._make(np.take(column, met) for column in hits), towards)
+        if depth == 0 and first is not None:
+            hits = first
+        else:
+            moving = np.repeat(nonzero_rows(towards)[:, None], 3, axis=1).astype(np.float32)
+            ends, hits = first_cells(snapshot, trace, gather, route, origins, towards, moving)
+            met = np.flatnonzero(ends == DETOUR)
+            ends[met] = NOTHING
+            cell[path] = ends
+            path, towards = path[met], towards[met]
+            hits = Hits._make(np.take(column, met) for column in hits)
+        points = shade_hits(snapshot, hits, towards)
         through, state = throughput[path], np.empty(len(path), np.uint8)
         tracing.step_paths(points, towards, counters[path], seed & 0xFFFFFFFF, depth, through, state)
         throughput[path] = through

@@ -165,12 +165,7 @@ class Judge:
         for first in range(0, len(samples), _CHUNK):
             part = slice(first, min(first + _CHUNK, len(samples)))
             wrong = self._errors(samples[part], table.rows(part.start, part.stop), record_view)
-            one, two = wrong[:, 0], wrong[:, 1]
-            product = one * two
-            least = np.minimum(np.abs(one), np.abs(two))
-            out.sure[part] = np.where(product > 0, least * least, 0) @ self.weight
-            out.mean[part] = product @ self.weight
-            out.noise[part] = 0.5 * (one - two) ** 2 @ self.weight
+            kernels.score_errors(wrong, self.weight, out.sure[part], out.mean[part], out.noise[part])
         return out
 
     def _errors(self, samples: I64, table: SparseRows, record_view: I64) -> F32:

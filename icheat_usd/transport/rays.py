@@ -20,7 +20,7 @@ from icheat_usd.kernels.workers import overlapping
 from icheat_usd.materials import sample_specular, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples
-from icheat_usd.scene import F32, I32, I64, U8, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I32, I64, U8, Hits, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer, first_surfaces, spawn_points
 from icheat_usd.transport.cell_paths import cells_behind
 from icheat_usd.transport.sparse import SparseRows, add_shares, concatenate_rows, placed_rows
@@ -159,9 +159,11 @@ class RowBuilder:
         """Units of light that arrive from cells."""
         geometry, gather = self._snapshot.geometry, self._gather
         n = len(rays.stream)
-        count, n_detours = np.empty(n, np.int64), np.empty(n, np.int64)
+        count = np.empty(n, np.int64)
         key, hits = (np.empty((n, min(rays.n_rays, counter.n_keys)), np.int32) for _ in range(2))
-        detour = np.empty((n, rays.n_rays), np.int32)
+        together = gather_kernels.block_rows(rays.n_rays)
+        n_detours = np.empty(-(-n // together), np.int64)
+        detour = np.empty((gather_kernels.DETOUR_COLUMNS, len(n_detours), together * rays.n_rays), np.int32)
         gather_kernels.count_hits(
             trace,
             lookup,
@@ -194,16 +196,20 @@ class RowBuilder:
         begin = np.concatenate([[0], np.cumsum(n_detours)])
         if begin[-1] == 0:
             return rows
-        ray = np.empty(begin[-1], np.int32)
-        row_kernels.pack_ints(n_detours, begin, detour, ray)
-        row = np.repeat(np.arange(n), n_detours)
-        ends = self._ends(rays, row, ray, all_detour=True)
+        found = np.empty((len(detour), begin[-1]), np.int32)
+        for column, packed in zip(detour, found, strict=True):
+            row_kernels.pack_ints(n_detours, begin, column, packed)
+        ray, instance, triangle = found[:3]
+        first = Hits(found[3].view(np.float32), instance, triangle, *found[4:].view(np.float32))
+        row, ray = np.divmod(ray, rays.n_rays)
+        row += np.repeat(np.arange(len(n_detours)) * together, n_detours)
+        ends = self._ends(rays, row, rays.first_ray + ray, first)
         return add_shares(rows, 1, _counted(row, *ends, n, counter.n_keys), 1, 1)
 
-    def _ends(self, rays: _Rays, row: I64, ray: I32 | I64, all_detour: bool = False) -> tuple[I64, I64, I64]:
+    def _ends(self, rays: _Rays, row: I64, ray: I32 | I64, first: Hits | None = None) -> tuple[I64, I64, I64]:
         """Where some rays end: number of the ray in `row`, column and units of light.
 
-        `all_detour`: each of them is known to meet a surface that does not simply reflect.
+        `first`: what they meet first, where it is known, and all of it may not simply reflect.
         """
         n = len(row)
         origins, directions = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
@@ -224,10 +230,10 @@ class RowBuilder:
         )
         cell: I32
         weight: F32 | None
-        if all_detour:
-            cell, weight = self._cells_behind(origins, directions, counter, rays.seed)
-        else:
+        if first is None:
             cell, weight = self._cells(origins, directions, counter, rays.seed)
+        else:
+            cell, weight = self._cells_behind(origins, directions, counter, rays.seed, first)
         which = np.flatnonzero(cell >= 0)
         units = np.full(n, _UNITS) if weight is None else np.rint(weight * np.float32(_UNITS)).astype(np.int64)
         column, units = cell[which].astype(np.int64), units[which]
@@ -330,12 +336,14 @@ class RowBuilder:
         cell[rest], weight[rest] = self._cells_behind(origins[rest], directions[rest], counters[rest], seed)
         return cell, weight
 
-    def _cells_behind(self, origins: F32, directions: F32, counters: I32, seed: int) -> tuple[I32, F32]:
+    def _cells_behind(
+        self, origins: F32, directions: F32, counters: I32, seed: int, first: Hits | None = None
+    ) -> tuple[I32, F32]:
         """Cell at the end of each path over mirrors, glass and holes, and the path's throughput."""
         trace = self._trace_table()
         if trace is not None:
             rays = trace, self._gather, self._route, origins, directions
-            cell, throughput = cells_behind(self._snapshot, *rays, counters, seed, _DETOUR_DEPTH)
+            cell, throughput = cells_behind(self._snapshot, *rays, counters, seed, _DETOUR_DEPTH, first)
             red, green, blue = throughput.T
             return cell, (red + green + blue) / np.float32(3)
         ends = first_surfaces(self._snapshot, self._tracer, origins, directions, seed, _DETOUR_DEPTH, counters)
