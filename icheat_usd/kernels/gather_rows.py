@@ -27,8 +27,6 @@ from icheat_usd.kernels.samples import basis, cosine_direction, cosine_lobe
 
 BATCH = 4096  # rays that are put in order of direction; their buffers fit the second-level cache
 _BINS = 16  # along each axis, of directions in the order of tracing
-#: Columns of the detours that `count_hits` finds: the ray in its block, and what it met; the last three are float32.
-DETOUR_RAY, DETOUR_INSTANCE, DETOUR_TRIANGLE, DETOUR_DISTANCE, DETOUR_U, DETOUR_V, DETOUR_COLUMNS = range(7)
 
 
 def thread_count() -> int:
@@ -156,6 +154,7 @@ def count_hits(  # type: ignore[no-untyped-def]
     out_hits,
     n_detours,
     detour,
+    met,
 ):
     """How many rays of each row end in each cell; keys are cells, and ascend.
 
@@ -181,13 +180,13 @@ def count_hits(  # type: ignore[no-untyped-def]
         Zero before and after.
     count : (n_rows,) int64, out_key, out_hits : (n_rows, room) int32
         Out: number of cells met; the cells; the rays that end in each.
-    n_detours : (n_blocks,) int64, detour : (DETOUR_COLUMNS, n_blocks, block_rows * n_rays) int32
-        Out: the rays of each block of `block_rows` that end on triangles which do not simply reflect, in the order
-        of tracing, in which those after one another go about the same way. Rays are counted row by row.
+    n_detours : (n_blocks,) int64, detour : (n_blocks, room) int32, met : Hits of (n_blocks, room)
+        Out: the rays of each block of `block_rows` that end on triangles which do not simply reflect, counted row by
+        row, and what they met; in the order of tracing, in which those after one another go about the same way.
     """
     n_rows = len(stream)
     together = block_rows(n_rays)
-    detour_float = detour.view(np.float32)
+    met_distance, met_instance, met_triangle, met_u, met_v = met.distance, met.instance, met.triangle, met.u, met.v
     n_lanes = counter.shape[0]
     mesh_begin, instance_mesh = trace.mesh_begin, trace.instance_mesh
     place, face, square, candidates = cells.place, cells.face, cells.square, cells.candidates
@@ -204,7 +203,7 @@ def count_hits(  # type: ignore[no-untyped-def]
 
         for block in range(lane, (n_rows + together - 1) // together, n_lanes):
             row_0, row_1 = block * together, min(n_rows, (block + 1) * together)
-            met = 0
+            n_met = 0
             done = 0
             while done < n_rays:
                 m = min(n_rays - done, BATCH)
@@ -248,15 +247,14 @@ def count_hits(  # type: ignore[no-untyped-def]
                         e = order[first + k]
                         key[e] = ends[CELL, k]
                         if ends[CELL, k] == DETOUR:
-                            detour[DETOUR_RAY, block, met] = e // m * n_rays + done + e % m
-                            detour[DETOUR_INSTANCE, block, met] = ends[INSTANCE, k]
-                            detour[DETOUR_TRIANGLE, block, met] = ends[TRIANGLE, k]
-                            detour_float[DETOUR_DISTANCE, block, met] = rays[8, k]
-                            detour_float[DETOUR_U, block, met] = rays[15, k]
-                            detour_float[DETOUR_V, block, met] = rays[16, k]
-                            met += 1
+                            detour[block, n_met] = e // m * n_rays + done + e % m
+                            met_instance[block, n_met] = ends[INSTANCE, k]
+                            met_triangle[block, n_met] = ends[TRIANGLE, k]
+                            met_distance[block, n_met] = rays[8, k]
+                            met_u[block, n_met], met_v[block, n_met] = rays[15, k], rays[16, k]
+                            n_met += 1
                 done += m
-                n_detours[block] = met
+                n_detours[block] = n_met
                 for r in range(row_0, row_1):
                     for k in range(m):
                         found = key[(r - row_0) * m + k]

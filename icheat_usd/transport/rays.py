@@ -33,6 +33,7 @@ _UNITS = 1024  # of a ray: counts stay whole numbers where mirrors and glass let
 #: Of a row that is measured in parts: float32 shares give back counts of units below 2^23.
 MOST_RAYS = (1 << 23) // _UNITS
 _LANES_PER_THREAD = 4  # few lanes are few counters, several even out the rows' cost
+_DETOUR = np.int32, np.float32, np.int32, np.int32, np.float32, np.float32  # a ray, and the columns of `Hits`
 _DETOUR_DEPTH = 8  # mirrors and faces of glass on a gather ray: what is trapped for longer is darkness to the row
 _WEAK_SPECULAR = 0.2  # reflectance at normal incidence; dielectrics have 0.02 to 0.17
 
@@ -163,7 +164,7 @@ class RowBuilder:
         key, hits = (np.empty((n, min(rays.n_rays, counter.n_keys)), np.int32) for _ in range(2))
         together = gather_kernels.block_rows(rays.n_rays)
         n_detours = np.empty(-(-n // together), np.int64)
-        detour = np.empty((gather_kernels.DETOUR_COLUMNS, len(n_detours), together * rays.n_rays), np.int32)
+        detour, *met = (np.empty((len(n_detours), together * rays.n_rays), kind) for kind in _DETOUR)
         gather_kernels.count_hits(
             trace,
             lookup,
@@ -189,6 +190,7 @@ class RowBuilder:
             hits,
             n_detours,
             detour,
+            Hits(*met),
         )
         begin = np.concatenate([[0], np.cumsum(count)])
         rows = SparseRows(begin, np.empty(begin[-1], np.int32), np.empty(begin[-1], np.float32), counter.n_keys)
@@ -196,14 +198,12 @@ class RowBuilder:
         begin = np.concatenate([[0], np.cumsum(n_detours)])
         if begin[-1] == 0:
             return rows
-        found = np.empty((len(detour), begin[-1]), np.int32)
-        for column, packed in zip(detour, found, strict=True):
-            row_kernels.pack_ints(n_detours, begin, column, packed)
-        ray, instance, triangle = found[:3]
-        first = Hits(found[3].view(np.float32), instance, triangle, *found[4:].view(np.float32))
-        row, ray = np.divmod(ray, rays.n_rays)
-        row += np.repeat(np.arange(len(n_detours)) * together, n_detours)
-        ends = self._ends(rays, row, rays.first_ray + ray, first)
+        packed = [np.empty(begin[-1], kind) for kind in _DETOUR]
+        for column, entries in zip((detour, *met), packed, strict=True):
+            row_kernels.pack_ints(n_detours, begin, column.view(np.int32), entries.view(np.int32))
+        row = np.repeat(np.arange(len(n_detours)) * together, n_detours) + packed[0] // rays.n_rays
+        ray = rays.first_ray + packed[0] % rays.n_rays
+        ends = self._ends(rays, row, ray, Hits(*packed[1:]))
         return add_shares(rows, 1, _counted(row, *ends, n, counter.n_keys), 1, 1)
 
     def _ends(self, rays: _Rays, row: I64, ray: I32 | I64, first: Hits | None = None) -> tuple[I64, I64, I64]:

@@ -12,7 +12,7 @@ from icheat_usd.kernels import records as kernels
 from icheat_usd.kernels.rows import pack_rows
 from icheat_usd.samples import ViewSamples
 from icheat_usd.scene import F32, F64, I32, I64, Bool, Camera
-from icheat_usd.transport.sparse import SparseRows
+from icheat_usd.transport.sparse import SparseRows, take_rows
 
 BUCKET = 8  # pixels
 _LEAST_GAIN = 0.005  # of the number of records: blocks to divide for which another round of rays is worth its time
@@ -326,13 +326,8 @@ def _block_of(level: I32) -> I64:
 
 def _apply(interpolation: SparseRows, samples: I64, response: F32) -> F32:
     """Interpolated responses of some samples: (2, n_lobes, n, n_lights)."""
-    begin, end = interpolation.indptr[samples], interpolation.indptr[samples + 1]
-    out = np.zeros((*response.shape[:2], len(samples), response.shape[3]), np.float32)
-    for k in range(int((end - begin).max(initial=0))):
-        has = np.flatnonzero(begin + k < end)
-        entry = begin[has] + k
-        out[:, :, has] += interpolation.weights[entry][:, None] * response[:, :, interpolation.indices[entry]]
-    return out
+    rows = take_rows(interpolation, samples)
+    return np.stack([np.stack([rows.matmul(lobe) for lobe in one]) for one in response])
 
 
 def _add_orphans(mesh: Mesh, most: int, shown: Bool, divisions: int) -> I64:

@@ -265,6 +265,28 @@ def test_the_table_finds_the_cells_of_the_walk() -> None:
     assert len(differ) < 0.002 * n
 
 
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_squares_of_a_sliver_are_short(first: int) -> None:
+    """A wall that is a fan of slivers: none of their squares crosses more samples than a list holds."""
+    rim = np.stack([np.linspace(-2, 2, 41), np.full(41, 4), np.zeros(41)], axis=1)
+    hub = np.broadcast_to(np.float64([0, -4, 0]), (40, 3))
+    fan = np.roll(np.stack([hub, rim[1:], rim[:-1]], axis=1), -first, axis=1).astype(np.float32)
+    floor = quad(4, 4) + np.float32([0, 0, 5])
+    scene = make_snapshot([Mesh(fan, path="/fan"), Mesh(floor, path="/floor")], camera=look_at((0, 0, 4)))
+    tracer = build_tracer(scene)
+    gather = gather_samples(scene, tracer, view_samples(scene, tracer), n=2000)
+    table = build_cell_map(scene.geometry, gather.locator).table
+    rng = np.random.default_rng(4)
+    u, v = np.sort(rng.random((2, 4000)), axis=0)
+    entries = [
+        cell_kernels.entry_at(table.place, table.face, table.square, 0, t, 0, a, np.float32(b - a))
+        for t, a, b in zip(rng.integers(0, 40, 4000), u.astype(np.float32), v, strict=True)
+    ]
+    assert not np.any(np.equal(entries, cell_kernels.WALK))
+    listed = np.unique([-1 - e for e in entries if e < 0])
+    assert len(listed) and table.candidates[listed].mean() < 4
+
+
 def test_placements_with_too_many_triangles_go_without_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, tracer, view, gather = prepared(True)
     monkeypatch.setattr("icheat_usd.samples.cell_map.MOST_PLACED", 10)
