@@ -45,7 +45,7 @@ RECORDS = replace(PREVIEW, record_error=0.01, rays_per_bounce_row=256)
 
 #: The same, packed so that a frame takes milliseconds. Lights that an artist sets lose a third to all of what plausible
 #: lights lose, among which are beams on few cells; what is lost beyond this is noise of the rows.
-LIVE = replace(RECORDS, record_error=0.0125, record_rays=1920, rest_bounce_rays=1024, packing_error=0.0275)
+LIVE = replace(RECORDS, record_error=0.0125, rest_bounce_rays=1024, packing_error=0.0275)
 
 #: For a close look at what lives on.
 LIVE_FINE = replace(
