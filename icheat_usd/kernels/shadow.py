@@ -7,7 +7,7 @@ distance and cosines of a single point would have.
 
 While a light moves little by little, most places see what they saw. Every place keeps what its last ray met. A
 frame sends the rays of a part of each run of places, another part each time; where these meet what they met
-before, the others keep what they know, and where one does not, all of the run are sent. Where points of the light
+before, the others keep what they know, and where one does not, all next to it are sent. Where points of the light
 itself came behind a surface or out of it, as on a light that is pushed into a wall, that is so for places everywhere,
 and few places tell. One that came behind is taken to be hidden from all others, too, and one that came out to be seen
 as the other points are where these all look alike; the part of rays that is sent finds where that is wrong. Between
@@ -26,12 +26,14 @@ from icheat_usd.kernels.embree import PACKET, call_packet
 from icheat_usd.kernels.lanes import minus, where_above
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
 from icheat_usd.kernels.shadow_lanes import CANDIDATE, RUN, look, shine
-from icheat_usd.kernels.simd import address_of, load, multiply_add, plus, product, spread, store
+from icheat_usd.kernels.simd import address_of, fetch, load, multiply_add, plus, product, spread, store
 
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
 PLACE, TINT, GLOSS = 9, 3, 12  #: columns of the tables of places
 PART = 8  #: one of so many places of a run sends a ray where all have met the same so far, and that is enough
-_MIXED_PART = 4  # the same of other runs, and of those that nothing is known of
+SHARED_PART = 16  #: the same of runs whose places share rays, of which nothing is told to others
+_MIXED_PART = 4  # the same of other runs, of those behind glass and leaves, and of those that nothing is known of
+_BESIDE = 16  # successive places of a run, such as 4 x 4 pixels, that are all sent where one meets something else
 STATES = 4  #: a place knows STATES * point + state
 #: What is told of a point of the light: of places that see it, now or before, some met something else, or nearly all
 #: see it now and did not before; hardly any place sees it.
@@ -41,6 +43,7 @@ _RUNS = 16  # of a task, whose rays fill packets together
 _INVALID = np.uint32(0xFFFFFFFF)
 _STOP_SHORT = np.float32(1.0 - 1e-4)  # as for other shadow rays: lights may lie in the plane of a ceiling
 _BLOCKED, _CLEAR, _THROUGH = 0, 1, 2
+_STILL_THROUGH = 3  # in a look alone: as it was known, and no ray was sent
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _FOUND = 4  # rows of what a run finds: direction to the chosen point (for distant lights) or way to it, and light
 # How far sums of products of float32 numbers may be from what they are: what is called turned away by more is so.
@@ -147,10 +150,11 @@ def _ask(
 ) -> None:  # fmt: skip
     """Which places of a run send a ray at first, and what the others know; `chosen` is -1 where there is no point."""
     if phase >= 0:
-        part = (_MIXED_PART if alike == -1 else PART) - 1
+        part = (_MIXED_PART if alike == -1 or alike == _THROUGH else SHARED_PART if share_rays else PART) - 1
         for j in range(len(known)):
             same = known[j] >> 2 == chosen[j]
-            state[j] = known[j] & 3 if same and chosen[j] >= 0 else _BLOCKED
+            was = _STILL_THROUGH if known[j] & 3 == _THROUGH else known[j] & 3
+            state[j] = was if same and chosen[j] >= 0 else _BLOCKED
             asks[j] = 1 if chosen[j] >= 0 and (not same or (j ^ phase) & part == 0) else 0
         if len(told) > 0:
             for j in range(len(known)):
@@ -169,30 +173,31 @@ def _ask(
 
 
 @kernel
-def _agree(
+def _doubt(
     rows: np.ndarray, offset: int, chosen: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
     told: np.ndarray, alike: int, state: np.ndarray,
-) -> bool:  # fmt: skip
-    """Whether the rays of a run, those of `rows` less `offset`, allow that its other places send none."""
+) -> int:  # fmt: skip
+    """Where other places of a run are to send rays, by those of `rows` less `offset`: a bit for `_BESIDE` places."""
+    doubted, every = 0, (1 << RUN // _BESIDE) - 1
     if phase >= 0:
-        agree = True
         for q in range(len(rows)):
             j = rows[q] - offset
             if len(told) > 0 and told[chosen[j]] & TURNED != 0:
                 foretold = _foretold(chosen[j], told, alike)
-                agree &= foretold < 0 or foretold == state[j]
+                doubted |= every if foretold >= 0 and foretold != state[j] else 0
             elif len(told) == 0 or told[chosen[j]] & BURIED == 0:
-                agree &= known[j] >> 2 != chosen[j] or known[j] & 3 == state[j]
-        return agree
+                differs = known[j] >> 2 == chosen[j] and known[j] & 3 != state[j]
+                doubted |= 1 << j // _BESIDE if differs else 0
+        return doubted
     if not share_rays:
-        return True
+        return 0
     common = state[rows[0] - offset] if len(rows) >= RUN // 8 else _THROUGH
     for q in range(len(rows)):
         common = common if state[rows[q] - offset] == common else _THROUGH
     for j in range(RUN):
         if chosen[j] >= 0 and (j & (_MIXED_PART - 1)) != 0:
             state[j] = common
-    return bool(common != _THROUGH)
+    return every if common == _THROUGH else 0
 
 
 @kernel
@@ -226,9 +231,10 @@ def _meet(
         offset = k * RUN
         some = rows[begin[k] : begin[k + 1]]
         knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
-        if not _agree(some, offset, chosen[k], share_rays, phase, knows, told, alike[k], state[k]):
+        doubted = _doubt(some, offset, chosen[k], share_rays, phase, knows, told, alike[k], state[k])
+        if doubted != 0:
             for j in range(RUN):
-                asks[k, j] = 1 if chosen[k, j] >= 0 and asks[k, j] == 0 else 0
+                asks[k, j] = 1 if doubted >> j // _BESIDE & 1 != 0 and chosen[k, j] >= 0 and asks[k, j] == 0 else 0
             count = _append_rows(asks[k], offset, count, others)
     _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, others, count, every_state)
 
@@ -321,6 +327,14 @@ def _get_nothing(run: int, row: np.ndarray, out: np.ndarray, through: np.ndarray
 
 
 @kernel
+def _fetch_run(table: int, run: int, n_columns: int) -> None:
+    """Ask for the columns of a run, from the address of a table, before they are needed."""
+    begin = table + run * (n_columns * RUN * 4)
+    for line in range(n_columns * RUN // 16):
+        fetch(begin + line * 64)
+
+
+@kernel
 def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
     colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray, place: np.ndarray,
@@ -351,6 +365,9 @@ def _light_runs(
     n = 0
     for i in range(first, last):
         run = np.int64(wanted[i])
+        # Tables of runs stream by once a frame, and the next is asked for while this one is looked at.
+        _fetch_run(address_of(place), np.int64(wanted[min(i + 1, last - 1)]), PLACE)
+        _fetch_run(address_of(tint), run, TINT)
         if is_turned_away(bounds[run], light, distant):
             _get_nothing(run, row, out, through, known)
             continue
@@ -386,11 +403,12 @@ def _light_runs(
             out[target, 0], out[target, 1], out[target, 2] = red[j], green[j], blue[j]
         if len(through) > 0:
             for j in range(size):
-                through[of_run + j] = 1 + chosen[k, j] if state[k, j] == _THROUGH else 0
+                sign = 1 if state[k, j] == _THROUGH else -1 if state[k, j] == _STILL_THROUGH else 0
+                through[of_run + j] = sign * (1 + chosen[k, j])
         if len(known) > 0:
             knows = known[of_run : of_run + size]
             for j in range(size):
-                knows[j] = STATES * chosen[k, j] + state[k, j] if chosen[k, j] >= 0 else -1
+                knows[j] = STATES * chosen[k, j] + min(state[k, j], _THROUGH) if chosen[k, j] >= 0 else -1
     storage[0] = _ZERO  # Numba may free an array after its last mention, and addresses do not count.
     numbers[0] = _ZERO
 
@@ -465,7 +483,7 @@ def light_places(
     out : (n, 3) float32, set
     through : (n,) int32, set
         1 + point of the light where only see-through surfaces are in the way, and `out` is what the place would get
-        without them; else 0. None: there are no such surfaces.
+        without them; less than 0 where no ray was sent, as that is known; else 0. None: there are no such surfaces.
     """
     n_runs = len(wanted)
     n_tasks = (n_runs + _RUNS - 1) // _RUNS

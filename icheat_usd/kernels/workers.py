@@ -16,8 +16,17 @@ from icheat_usd.kernels._jit import kernels_may_overlap
 Made = TypeVar("Made")
 
 _MOST_AT_ONCE = 4  # pieces, each with an equal share of the workers: each holds memory
-_aside: ContextVar[tuple[Future[None], int] | None] = ContextVar("_aside", default=None)  # pieces, and all workers
+_pair: ContextVar[_Pair | None] = ContextVar("_pair", default=None)
 _is_one_of_many: ContextVar[bool] = ContextVar("_is_one_of_many", default=False)
+
+
+class _Pair:
+    """Two threads beside each other."""
+
+    def __init__(self, n_threads: int, pieces: Sequence[Callable[[], None]]) -> None:
+        self.n_threads = n_threads  #: that they share
+        self.left = deque(pieces)
+        self.aside: Future[None] | None = None  #: the other thread's work; None: there is one thread
 
 
 def start_workers() -> None:
@@ -65,7 +74,7 @@ def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Ma
 
     For frames, where a chain of short steps leaves workers idle: each of the two threads has half of the workers
     until the pieces are done, of which the work hears where it asks `take_back`. Where kernels may not overlap, all is
-    done one after the other.
+    done one after the other: the work, but for pieces that it asks for by `do_pieces`, and then those.
 
     Parameters
     ----------
@@ -79,31 +88,43 @@ def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Ma
     """
     start_workers()
     n_threads = numba.get_num_threads()
-    left = deque(pieces)
-    if n_threads < 2 or _is_one_of_many.get() or not kernels_may_overlap():
-        made = work()
-        _do_what_is_left(left)
-        return made
-    aside = _beside().submit(copy_context().run, _with_workers, n_threads // 2, left)
-    numba.set_num_threads(n_threads - n_threads // 2)
-    outer = _aside.set((aside, n_threads))
+    pair = _Pair(n_threads, pieces)
+    outer = _pair.set(pair)
     try:
-        made = work()
-        _do_what_is_left(left)
+        if n_threads < 2 or _is_one_of_many.get() or not kernels_may_overlap():
+            made = work()
+            _do_what_is_left(pair.left)
+            return made
+        pair.aside = _beside().submit(copy_context().run, _with_workers, n_threads // 2, pair.left)
+        numba.set_num_threads(n_threads - n_threads // 2)
+        try:
+            made = work()
+            _do_what_is_left(pair.left)
+        finally:
+            pair.left.clear()
+            wait([pair.aside])
+            numba.set_num_threads(n_threads)
+        pair.aside.result()
+        return made
     finally:
-        left.clear()
-        wait([aside])
-        _aside.reset(outer)
-        numba.set_num_threads(n_threads)
-    aside.result()
-    return made
+        _pair.reset(outer)
 
 
 def take_back() -> None:
     """Within the work of `beside`: have all workers again from here on, if the pieces are done."""
-    aside = _aside.get()
-    if aside is not None and aside[0].done():
-        numba.set_num_threads(aside[1])
+    pair = _pair.get()
+    if pair is not None and pair.aside is not None and pair.aside.done():
+        numba.set_num_threads(pair.n_threads)
+
+
+def do_pieces() -> None:
+    """Within the work of `beside`: do the pieces that nobody has begun, of which something is needed now.
+
+    Pieces depend on nothing that the work does, so the work may wait for one that has begun.
+    """
+    pair = _pair.get()
+    if pair is not None:
+        _do_what_is_left(pair.left)
 
 
 @cache

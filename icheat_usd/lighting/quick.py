@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers
-from icheat_usd.kernels.shadow import GLOSS, PART, STRIDE, TURNED, light_places, tell_points
+from icheat_usd.kernels.shadow import GLOSS, PART, SHARED_PART, STRIDE, TURNED, light_places, tell_points
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.kernels.shaping import shape_places
 from icheat_usd.lighting.controls import darken, emission_frame, without
@@ -113,6 +113,7 @@ class LastLook:
 
     def __init__(self, places: Places) -> None:
         self.known = np.full(places.n, -1, np.int16)
+        self.crossing: F32 = np.ones(places.n, np.float32)  #: share of light, where see-through surfaces are in the way
         self.n = 0  #: looks so far
         self.told: I32 = _NO_POINTS  #: by the last `look_and_tell`
 
@@ -277,10 +278,11 @@ class Look:
         self._groups = shining.groups(_FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
         self._through = np.zeros(0 if shadows.passing is None else places.n, np.int32)
         self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
+        self._crossing = np.empty(len(self._through), np.float32) if last is None else last.crossing
         self.told = _NO_POINTS if told is None else told  #: of the light's points, for what is looked at from now on
         if last is not None:
             self._known = last.known
-            self._phase = last.n % PART if last.n else -1
+            self._phase = last.n % SHARED_PART if last.n else -1
             last.n += 1
 
     def pieces(self) -> list[Callable[[], None]]:
@@ -329,9 +331,11 @@ class Look:
         table, distant = self._shining.table, self._shining.distant
         if len(self._through):
             rows = np.flatnonzero(self._through != 0)  # of bool, several times as fast
-            origin, end = places.place[rows // RUN, :3, rows % RUN], table[self._through[rows] - 1, :3]
+            sent = rows[self._through[rows] > 0]
+            origin, end = places.place[sent // RUN, :3, sent % RUN], table[self._through[sent] - 1, :3]
             direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
-            out[places.row[rows]] *= self._shadows.crossing(snapshot, origin, direction, limit)[:, None]
+            self._crossing[sent] = self._shadows.crossing(snapshot, origin, direction, limit)
+            out[places.row[rows]] *= self._crossing[rows, None]
         shaping = snapshot.controls(0).shaping
         if shaping is not None:
             # The choice among points was made without it, which the mean over choices does not notice.

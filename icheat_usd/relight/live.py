@@ -6,6 +6,8 @@ import copy
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
+from threading import Event
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +18,7 @@ from icheat_usd.errors import EditError, SampleSetMismatch
 from icheat_usd.kernels import terms as kernels
 from icheat_usd.kernels.assemble import sum_scaled
 from icheat_usd.kernels.film_table import FilmTable, film_table
+from icheat_usd.kernels.workers import beside, do_pieces
 from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.amount_films import AmountFilms
 from icheat_usd.relight.compiled import Way
@@ -445,20 +448,41 @@ class LiveRelighter:
             return
         if self._light_stale:
             self._by_group = self._light_by_group()
-            if self._narrow is not None:
-                self._shared.set_unedited_near_rest(self._narrow, self.lights.radiance, self.lights.gains)
-            else:
-                self._shared.set_unedited(self._light())
             self._n_exact = 0
             self._base_stale = True
             self._versions.light_changed(self._by_group)
+            self._multiply_light()
             samples = self._mixed_samples
         else:
+            self._versions.update()
             samples = self._changed_places()
-        self._versions.update()
         self._show(samples)
         self._light_stale = False
         self._changed_rows, self._changed_samples = set(), []
+
+    def _multiply_light(self) -> None:
+        """Unedited light, and beside it that of versions, which depends on how bright the image is."""
+        is_seen = Event()
+
+        def unedited() -> None:
+            try:
+                if self._narrow is not None:
+                    radiance, gains = self.lights.radiance, self.lights.gains
+                    self._shared.set_unedited_near_rest(self._narrow, radiance, gains, is_seen.set)
+                else:
+                    self._shared.set_unedited(self._light(), is_seen.set)
+            finally:
+                is_seen.set()
+
+        def look() -> None:
+            do_pieces()
+            is_seen.wait()
+
+        if self._versions.has_work:
+            beside(partial(self._versions.update, look), [unedited])
+        else:
+            unedited()
+            self._versions.update()
 
     def _show(self, samples: I64) -> None:
         """Add up what groups share, and find the light of some samples that do not share theirs."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from icheat_usd.kernels.assemble import sum_scaled
@@ -70,8 +72,11 @@ class Narrow:
         """Other edits are shown; `step` chooses anew what matters to them."""
         self._n_versions = -1
 
-    def unedited(self, radiance: F32, gains: F32, out: F32) -> None:
-        """Products of lights (n_lights, n_gather, 3) under gains into ``out[:, : n_tiles]``."""
+    def unedited(self, radiance: F32, gains: F32, out: F32, seen: Callable[[], None] | None = None) -> None:
+        """Products of lights (n_lights, n_gather, 3) under gains into ``out[:, : n_tiles]``.
+
+        `seen` is called as by `Products.multiply_all`.
+        """
         is_same = self._compare(radiance)
         factors = np.zeros((len(self._known), 4 * 16), np.float32)
         n = min(len(radiance), len(factors))
@@ -89,6 +94,8 @@ class Narrow:
             out[:, :n_tiles] = 0
             add(out, every)
             self._products.see(out, every)
+            if seen is not None:
+                seen()
         else:
             moved = np.flatnonzero(~is_same).tolist()
             rests = np.empty((len(moved), *radiance.shape[1:]), np.float32)
@@ -99,7 +106,7 @@ class Narrow:
                 else:
                     rests[i] = radiance[light]
             sum_scaled(rests, np.ascontiguousarray(gains[moved], np.float32), rest)
-            self._products.multiply_all(rest, out, known=add)
+            self._products.multiply_all(rest, out, add, seen)
 
     def products_of(self, light: int) -> F32:
         """Exact products of a light as it was at rest, (n_lobes, n_tiles, 64, 4)."""

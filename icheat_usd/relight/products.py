@@ -15,6 +15,7 @@ from icheat_usd.kernels.marked_terms import WORD, mark_terms, multiply_marked
 from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
 from icheat_usd.kernels.term_energy import least_of_versions
+from icheat_usd.kernels.workers import take_back
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
 from icheat_usd.scene import F32, F64, I32, I64, U8, Bool
@@ -122,6 +123,7 @@ class _Tiles:
         # A few versions at a time, since each has marks of its own.
         many = np.unique(jobs.version)
         for first in range(0, len(many), _TOGETHER):
+            take_back()
             marked = many[first : first + _TOGETHER]
             of_these = jobs if len(marked) == len(many) else jobs.some(np.isin(jobs.version, marked))
             self._multiply_marked(versions, size, least, marked, of_these, flat)
@@ -349,9 +351,13 @@ class Products:
         return end
 
     def multiply_all(
-        self, b: F32, out: F32, narrow: bool = False, known: Callable[[F32, I32], None] | None = None
+        self,
+        b: F32,
+        out: F32,
+        known: Callable[[F32, I32], None] | None = None,
+        seen: Callable[[], None] | None = None,
     ) -> None:
-        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``; `narrow`: as `multiply`.
+        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``.
 
         Of a large transport, only the terms that are large in this light are read; see `LEFT_OUT`.
 
@@ -359,6 +365,8 @@ class Products:
         ----------
         known
             Adds to the products of some tiles what is known of others, so that together they are the unedited light.
+        seen
+            Called, by a large transport alone, once `multiply` may be called for other light than before.
         """
         tile = np.arange(self.n_tiles, dtype=np.int32)
         if not self._haar:
@@ -366,8 +374,8 @@ class Products:
             values[0, :, :3] = b
         else:
             values = haar_of_versions(self._plan, b[None], self._unedited)
-        tiles = self._narrow if narrow else self._tiles
-        if tiles is None or self._large_terms is None or narrow:
+        tiles = self._tiles
+        if tiles is None or self._large_terms is None:
             if tiles is None:
                 for lobe, rows in enumerate(self._rows):
                     self._multiply_floats(rows, values, tile, 0 * tile, out[lobe, : self.n_tiles])
@@ -386,8 +394,11 @@ class Products:
         if known is not None:
             known(looked_at, some)
         self.see(looked_at, some)
+        if seen is not None:
+            seen()
         least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
         leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
+        take_back()
         tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out, np.zeros(1, np.bool_))
         if known is not None:
             known(out, tile)

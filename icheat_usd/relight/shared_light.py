@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -104,17 +105,19 @@ class SharedLight:
         n_tiles = self._products.n_tiles
         self._sums[:, :n_tiles] = other._sums[:, :n_tiles]
 
-    def set_unedited(self, b: F32) -> None:
-        """Multiply the transport with the unedited light (n_gather, 3)."""
-        self._products.multiply_all(b, self._sums)
+    def set_unedited(self, b: F32, seen: Callable[[], None] | None = None) -> None:
+        """Multiply the transport with the unedited light (n_gather, 3); `seen` as for `Products.multiply_all`."""
+        self._products.multiply_all(b, self._sums, seen=seen)
 
     def refine_unedited(self, b: F32, exact: Products, first: int) -> int:
         """Multiply some tiles of exact rows with the unedited light, from `first` on; the first tile that is left."""
         return exact.multiply_more(b, first, self._sums)
 
-    def set_unedited_near_rest(self, narrow: Narrow, radiance: F32, gains: F32) -> None:
+    def set_unedited_near_rest(
+        self, narrow: Narrow, radiance: F32, gains: F32, seen: Callable[[], None] | None = None
+    ) -> None:
         """The same of lights (n_lights, n_gather, 3) under gains, of which some may be as they were at rest."""
-        narrow.unedited(radiance, gains, self._sums)
+        narrow.unedited(radiance, gains, self._sums, seen)
 
     def unedited(self, out: F32) -> None:
         """Unedited indirect light of all view samples into `out`."""

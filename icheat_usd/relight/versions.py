@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
 from icheat_usd.kernels.residuals import add_version_residuals, proportions
 from icheat_usd.kernels.versions import CONSTANT
+from icheat_usd.kernels.workers import take_back
 from icheat_usd.relight.atoms import Atoms, AtomSums, find_atoms
 from icheat_usd.relight.compiled import CompiledStack, Way
 from icheat_usd.relight.growing import Growing
@@ -272,12 +273,17 @@ class Versions:
         done = ~np.isin(version, list(self._stale | self._unsummed))
         self._multiply(fresh[done])
 
-    def update(self) -> None:
-        """Evaluate what has changed since the last time."""
-        self._evaluate()
+    @property
+    def has_work(self) -> bool:
+        """Whether there is something to multiply in `update`."""
+        return bool(self._stale)
+
+    def update(self, look: Callable[[], None] | None = None) -> None:
+        """Evaluate what has changed since the last time; `look` returns once products of new light may be made."""
+        self._evaluate(look)
         self._add_up()
 
-    def _evaluate(self) -> None:
+    def _evaluate(self, look: Callable[[], None] | None) -> None:
         if not self._stale:
             return
         assert self._light is not None
@@ -304,6 +310,9 @@ class Versions:
             proportions(some, self._deltas, self._reference, factors, rest, size)
             differs |= size[plain, 0] > _ROUNDED * size[plain, 1]
         self._products.prepare(plain[differs], tables, rest)
+        if look is not None:
+            look()
+        take_back()
         self._multiply(self._pairs_of_some(plain[~known]))
         self._multiply_rest(plain[known & differs], plain[known], factors)
         for v in stale:

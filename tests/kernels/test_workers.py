@@ -13,7 +13,7 @@ import pytest
 
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
-from icheat_usd.kernels.workers import beside, overlapping, take_back
+from icheat_usd.kernels.workers import beside, do_pieces, overlapping, take_back
 
 
 @numba.njit(parallel=True, nogil=True)
@@ -173,6 +173,25 @@ def test_with_one_worker_pieces_follow_the_work() -> None:
     finally:
         numba.set_num_threads(before)
     assert done == ["work", "first", "second"]
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_work_can_wait_for_a_piece_whoever_does_it(n_threads: int) -> None:
+    made = threading.Event()
+
+    def work() -> bool:
+        do_pieces()
+        return made.wait(10)
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(n_threads, before))
+    try:
+        for _ in range(50):
+            made.clear()
+            assert beside(work, [made.set]), "nobody did the piece"
+    finally:
+        numba.set_num_threads(before)
+    do_pieces()  # which means nothing elsewhere
 
 
 @pytest.mark.parametrize("fails", ["work", "piece"])

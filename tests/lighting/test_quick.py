@@ -7,12 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.shadow import APPEARED, BURIED, PART, TURNED, is_turned_away
+from icheat_usd.kernels.shadow import APPEARED, BURIED, PART, SHARED_PART, TURNED, is_turned_away
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
 from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
 from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
-from icheat_usd.lighting.quick import LastLook, build_shadows, direct_at, look_and_tell, prepare_places, shining_points
+from icheat_usd.lighting.quick import (
+    LastLook,
+    Shadows,
+    build_shadows,
+    direct_at,
+    look_and_tell,
+    prepare_places,
+    shining_points,
+)
 from icheat_usd.lighting.sampler import prepare_light_sampler
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
@@ -125,8 +133,15 @@ def test_runs_that_share_rays_agree_with_rays_of_their_own() -> None:
     assert (np.abs(own - shared) > 1e-6).any(axis=1).mean() < 0.01
 
 
-def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
-    """Near the look before a part of the rays is enough; where the light then stays, none of what was kept is old."""
+@pytest.mark.parametrize("share", [False, True])
+def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks(
+    monkeypatch: pytest.MonkeyPatch, share: bool
+) -> None:
+    """Near the look before a part of the rays is enough, also of those through glass and leaves; where the light then
+    stays, none of what was kept is old."""
+    crossed: list[int] = []
+    crossing = Shadows.crossing
+    monkeypatch.setattr(Shadows, "crossing", lambda *a: (crossed.append(len(a[2])), crossing(*a))[1])
     first = scene(LIGHTS["rect"], Material(0.5))
     points = on_floor(first, 3000)
     order = np.lexsort((points.position[:, 0], np.floor(points.position[:, 2] * 20)))
@@ -135,14 +150,21 @@ def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks() -> None:
     last, images = LastLook(places), LightImages(first.textures)
     alone = one_light(first, 0)
     old = []
-    for step in range(8 + PART):
+    for step in range(8 + (SHARED_PART if share else PART)):
         moved = translation(0.02 * min(step, 8), 0, 0) @ np.vstack([LIGHTS["rect"].to_world, [0, 0, 0, 1]])
         alone = changed_light(images, alone, to_world=moved[:3])
-        direct_at(alone, shadows, places, 5, False, found, last=last)
-        direct_at(alone, shadows, places, 5, False, fresh)
-        old.append((found != fresh).any(axis=1).mean())
+        direct_at(alone, shadows, places, 5, share, found, last=last)
+        direct_at(alone, shadows, places, 5, share, fresh)
+        old.append((abs(found - fresh) > 0.02 * fresh.max()).any(axis=1).mean())
     assert (fresh.sum(axis=1) == 0).mean() > 0.01
     assert old[0] == 0.0 and max(old) < 0.02
+    of_found, of_fresh = crossed[::2], crossed[1::2]
+    assert of_found[0] == of_fresh[0] > 200
+    assert np.sum(of_found[1:]) < np.sum(of_fresh[1:]) / 2
+    if share:  # at last every place has had its ray, of which one look spares some
+        assert (found != fresh).any(axis=1).mean() < 0.01
+        for _ in range(SHARED_PART):
+            direct_at(alone, shadows, places, 5, share, fresh, last=last)
     np.testing.assert_array_equal(found, fresh)
 
 
@@ -184,7 +206,7 @@ def test_of_a_light_that_is_pushed_into_a_wall_and_pulled_out_some_places_tell_t
     assert ((fresh == 0).all(axis=1).mean() > 0.2) == has_table  # below it, beside those whose point is behind the wall
     # Without a word, by runs of which no ray went to a point that has crossed; with it, at the border of the shadow.
     assert np.mean(missed) > 0.005
-    assert max(wrong) < 0.01 and np.mean(wrong) < np.mean(missed) / 2 if has_table else max(wrong) == 0
+    assert max(wrong) < np.mean(missed) / 2 if has_table else max(wrong) == 0
     assert n_crossed > 40 and 0.1 < behind.mean() < 0.9
 
 
