@@ -31,7 +31,7 @@ from icheat_usd.kernels.simd import (
     zeros,
 )
 
-_LEAST = 8  # cells of a part of a cluster
+_LEAST = 4  # cells of a part of a cluster
 LANES = 64  # rows of a block of a dense matrix
 
 

@@ -276,7 +276,7 @@ class Look:
             self._gloss[:, :_ALPHA] *= np.float32(controls.specular)
         self._seed, self._share_rays, self._turn = seed, share_rays, turn
         self._groups = shining.groups(_FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
-        self._through = np.zeros(0 if shadows.passing is None else places.n, np.int32)
+        self._through = np.empty(0 if shadows.passing is None else places.n, np.int32)
         self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
         self._crossing = np.empty(len(self._through), np.float32) if last is None else last.crossing
         self.told = _NO_POINTS if told is None else told  #: of the light's points, for what is looked at from now on
@@ -325,12 +325,20 @@ class Look:
             self._through,
         )
 
-    def finish(self) -> None:
-        """Dim what is lit: see-through surfaces, the light's shaping, and surfaces that it does not light."""
+    def finish(self, runs: I32 | None = None) -> None:
+        """Dim what is lit: see-through surfaces, the light's shaping, and surfaces that it does not light.
+
+        All `runs` (n_runs,) that are meant, by default every one, have to be lit before.
+        """
         snapshot, places, out = self._snapshot, self._places, self._out
         table, distant = self._shining.table, self._shining.distant
         if len(self._through):
-            rows = np.flatnonzero(self._through != 0)  # of bool, several times as fast
+            if runs is None:
+                rows = np.flatnonzero(self._through != 0)  # of bool, several times as fast
+            else:
+                rows = (runs[:, None].astype(np.int64) * RUN + np.arange(RUN)).ravel()
+                rows = rows[rows < places.n]
+                rows = rows[self._through[rows] != 0]
             sent = rows[self._through[rows] > 0]
             origin, end = places.place[sent // RUN, :3, sent % RUN], table[self._through[sent] - 1, :3]
             direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
@@ -416,4 +424,4 @@ def direct_at(
     shining = shining or shining_points(snapshot, seed)
     look = Look(snapshot, shadows, places, shining, seed, share_rays, out, turn, last, told)
     look.light(np.arange(len(places.place), dtype=np.int32) if runs is None else runs)
-    look.finish()
+    look.finish(runs)

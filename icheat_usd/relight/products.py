@@ -43,6 +43,8 @@ _TILES_LOOKED_AT = 16
 _ENTRIES_AT_ONCE = 5_000_000
 #: Versions that are transformed, or whose terms are marked, at once.
 _TOGETHER = 8
+#: Products that are made in one go; in between, workers that have become free help.
+_JOBS = 512
 
 _NONE: F32 = np.zeros((1, 0), np.float32)
 
@@ -142,7 +144,11 @@ class _Tiles:
         for v, of_version in zip(marked, marks, strict=True):
             mark_terms(columns.begin, columns.most, columns.worth, columns.pair, size[v], least[v], of_version)
         row = np.searchsorted(marked, jobs.version).astype(np.int32)
-        multiply_marked(begin, index, scale, value, versions, marks, jobs.tile, jobs.version, row, jobs.place, out)
+        for first in range(0, len(row), _JOBS):
+            take_back()
+            some = slice(first, first + _JOBS)
+            columns_of_jobs = jobs.tile[some], jobs.version[some], row[some], jobs.place[some]
+            multiply_marked(begin, index, scale, value, versions, marks, *columns_of_jobs, out)
 
 
 class Products:
