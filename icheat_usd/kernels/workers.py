@@ -27,6 +27,7 @@ class _Pair:
         self.n_threads = n_threads  #: that they share
         self.left = deque(pieces)
         self.aside: Future[None] | None = None  #: the other thread's work; None: there is one thread
+        self.is_waited_for = False  #: whether pieces that have begun are all that is not done
 
 
 def start_workers() -> None:
@@ -72,9 +73,9 @@ def overlapping(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
 def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Made:
     """Do some work while another thread does pieces that do not depend on it; at last this one helps with the pieces.
 
-    For frames, where a chain of short steps leaves workers idle: each of the two threads has half of the workers
-    until the pieces are done, of which the work hears where it asks `take_back`. Where kernels may not overlap, all is
-    done one after the other: the work, but for pieces that it asks for by `do_pieces`, and then those.
+    For frames, where chains of short steps leave workers idle: each of the two threads has half of the workers until
+    the other has nothing to do, of which it hears where it asks `take_back`. Where kernels may not overlap, all is done
+    one after the other: the work, but for pieces that it asks for by `do_pieces`, and then those.
 
     Parameters
     ----------
@@ -102,6 +103,7 @@ def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Ma
             _do_what_is_left(pair.left)
         finally:
             pair.left.clear()
+            pair.is_waited_for = True
             wait([pair.aside])
             numba.set_num_threads(n_threads)
         pair.aside.result()
@@ -111,9 +113,9 @@ def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Ma
 
 
 def take_back() -> None:
-    """Within the work of `beside`: have all workers again from here on, if the pieces are done."""
+    """Within the work or a piece of `beside`: have all workers from here on, if the other thread has nothing to do."""
     pair = _pair.get()
-    if pair is not None and pair.aside is not None and pair.aside.done():
+    if pair is not None and pair.aside is not None and (pair.is_waited_for or pair.aside.done()):
         numba.set_num_threads(pair.n_threads)
 
 

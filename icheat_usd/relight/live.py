@@ -40,6 +40,8 @@ from icheat_usd.transport.packed import PackedTransport
 
 #: More versions than this, and edits that have no casters in common are kept apart: a version takes a megabyte.
 MOST_VERSIONS = 192
+#: Products of versions, for each tile, that are made beside those of unedited light.
+MOST_BESIDE = 4
 #: As many groups and versions that nothing needs any more are kept, since forgetting them takes longer than a frame.
 SPARE_GROUPS, SPARE_VERSIONS = 1024, 32
 
@@ -478,7 +480,8 @@ class LiveRelighter:
             do_pieces()
             is_seen.wait()
 
-        if self._versions.has_work:
+        # Many versions keep all workers busy, and have them from the start.
+        if self._versions.has_work and self._versions.n_multiplied <= MOST_BESIDE * self._products.n_tiles:
             beside(partial(self._versions.update, look), [unedited])
         else:
             unedited()

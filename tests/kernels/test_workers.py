@@ -164,6 +164,24 @@ def test_work_has_all_workers_again_once_the_pieces_are_done(several_workers: No
     assert numba.get_num_threads() == n
 
 
+def test_a_piece_has_all_workers_once_nothing_but_it_is_left(several_workers: None) -> None:
+    shares: list[int] = []
+    begun = threading.Event()
+
+    def aside() -> None:
+        begun.set()
+        deadline = time.monotonic() + 10
+        while numba.get_num_threads() < n and time.monotonic() < deadline:
+            take_back()
+        shares.append(numba.get_num_threads())
+        shares.append(len(piece(3)))
+
+    n = numba.get_num_threads()
+    assert beside(lambda: begun.wait(10), [aside])
+    assert shares == [n, 100]
+    assert numba.get_num_threads() == n
+
+
 def test_with_one_worker_pieces_follow_the_work() -> None:
     done: list[str] = []
     before = numba.get_num_threads()
