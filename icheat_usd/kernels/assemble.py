@@ -34,35 +34,35 @@ _CHUNK = 1024  # pixels or view samples: what is between two passes over them st
 
 
 class _Places(NamedTuple):
-    """Addresses and their steps: handed on, arrays would cost more than the work."""
+    """Addresses: handed on, arrays would cost more than the work."""
 
     row: int
     weight: int
     tint: int
     lobe: int
-    products: int
-    products_step: int  # from lobe to lobe
 
 
 @kernel
-def _places(row, weight, tint, lobe, products):  # type: ignore[no-untyped-def]
-    return _Places(
-        address_of(row),
-        address_of(weight),
-        address_of(tint),
-        address_of(lobe),
-        address_of(products),
-        16 * products.shape[1],
-    )
+def _places(row, weight, tint, lobe):  # type: ignore[no-untyped-def]
+    return _Places(address_of(row), address_of(weight), address_of(tint), address_of(lobe))
 
 
 @kernel
-def _blend_run(at, first, n, out):  # type: ignore[no-untyped-def]
+def _blend_run(at, again_begin, again_tint, again_lobe, products, step, first, n, out):  # type: ignore[no-untyped-def]
     """Light of the first groups of `n` view samples, three floats each; one more is written."""
     row, weight, tint, lobe = at.row + 16 * first, at.weight + 16 * first, at.tint + 16 * first, at.lobe + first
-    for _ in range(n):
-        total = weighted_sum(at.products + load_byte(lobe) * at.products_step, row, load_color(weight))
-        store_color(out, color_product(total, load_color(tint)))
+    begin = np.int64(again_begin[first])
+    tint_again, lobe_again = address_of(again_tint) + 16 * begin, address_of(again_lobe) + begin
+    for i in range(first, first + n):
+        weights = load_color(weight)
+        light = weighted_sum(products + load_byte(lobe) * step, row, weights)
+        light = color_product(light, load_color(tint))
+        for _ in range(again_begin[i + 1] - again_begin[i]):
+            more = weighted_sum(products + load_byte(lobe_again) * step, row, weights)
+            light = color_add(more, load_color(tint_again), light)
+            tint_again += 16
+            lobe_again += 1
+        store_color(out, light)
         row += 16
         weight += 16
         tint += 16
@@ -71,26 +71,28 @@ def _blend_run(at, first, n, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_group(at, i, place):  # type: ignore[no-untyped-def]
+def _add_group(at, i, products, step, place):  # type: ignore[no-untyped-def]
     """Add the light of group `i` to a view sample's."""
-    products = at.products + load_byte(at.lobe + i) * at.products_step
-    total = weighted_sum(products, at.row + 16 * i, load_color(at.weight + 16 * i))
+    total = weighted_sum(products + load_byte(at.lobe + i) * step, at.row + 16 * i, load_color(at.weight + 16 * i))
     store_rgb(place, color_add(total, load_color(at.tint + 16 * i), load_rgb(place)))
 
 
 @kernel
 def _indirect_run(first, n, table, products, out):  # type: ignore[no-untyped-def]
     """Indirect light of `n` view samples to an address, three floats each; one more is written."""
-    row, weight, tint, lobe, more_view, more_row, more_weight, more_tint, more_lobe = table
+    row, weight, tint, lobe, again_begin, again_tint, again_lobe = table[:7]
+    more_view, more_row, more_weight, more_tint, more_lobe = table[7:]
     if len(products) == 0:
         for _ in range(n):
             store_rgb(out, black())
             out += 12
         return
-    _blend_run(_places(row, weight, tint, lobe, products), first, n, out)
-    more = _places(more_row, more_weight, more_tint, more_lobe, products)
-    for m in range(np.searchsorted(more_view, first), np.searchsorted(more_view, first + n)):
-        _add_group(more, m, out + 12 * (np.int64(more_view[m]) - first))
+    start, step = address_of(products), 16 * products.shape[1]  # from lobe to lobe
+    places = _places(row, weight, tint, lobe)
+    _blend_run(places, again_begin, again_tint, again_lobe, start, step, first, n, out)
+    more = _places(more_row, more_weight, more_tint, more_lobe)
+    for i in range(np.searchsorted(more_view, first), np.searchsorted(more_view, first + n)):
+        _add_group(more, i, start, step, out + 12 * (np.int64(more_view[i]) - first))
 
 
 @kernel

@@ -72,12 +72,15 @@ def _piece_products(now, before, out):  # type: ignore[no-untyped-def]
 @kernel
 def _take_proportional(now, before, factor, rest, size):  # type: ignore[no-untyped-def]
     left, whole = np.float32(0), np.float32(0)
+    of_left, of_whole = 0.0, 0.0
     for k in range(len(now)):
         for c in range(3):
             value = now[k, c] - factor[c] * before[k, c]
             rest[k, c] = value
             left, whole = max(left, abs(value)), max(whole, abs(now[k, c]))
-    size[0], size[1] = left, whole
+            of_left += np.float64(value) * np.float64(value)
+            of_whole += np.float64(now[k, c]) * np.float64(now[k, c])
+    size[0], size[1], size[2], size[3] = left, whole, of_left, of_whole
 
 
 @parallel_kernel
@@ -113,8 +116,8 @@ def proportions(pieces, now, before, factors, rest, size):  # type: ignore[no-un
         Receives a colour and pad, 16 times, of those that have pieces.
     rest : (n_cells, 3) float32
         Receives ``now - factor * before``.
-    size : (n_functions, 2) float32
-        Receives the largest size of that and of `now`, of those that have pieces.
+    size : (n_functions, 4) float64
+        Receives the largest size of that and of `now`, and the sums of their squares, of those that have pieces.
     """
     sums = np.empty((len(pieces), 6))
     _find_products(pieces, now, before, sums)
@@ -124,9 +127,11 @@ def proportions(pieces, now, before, factors, rest, size):  # type: ignore[no-un
     found = np.divide(both, squared, out=np.zeros_like(both), where=squared > 0)
     some = np.unique(pieces[:, 0])
     factors[some] = in_lanes(found[some])
-    sizes = np.empty((len(pieces), 2), np.float32)
+    sizes = np.empty((len(pieces), 4))
     _find_rest(pieces, now, before, factors, rest, sizes)
-    np.maximum.at(size, pieces[:, 0], sizes)
+    size[some] = 0
+    np.maximum.at(size[:, :2], pieces[:, 0], sizes[:, :2])
+    np.add.at(size[:, 2:], pieces[:, 0], sizes[:, 2:])
 
 
 @kernel

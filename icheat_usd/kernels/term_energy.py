@@ -56,7 +56,8 @@ def least_of_versions(versions, sizes, energy, largest, squared_error, share, le
         Largest channels of each version's coefficients.
     energy, largest
         See `sum_energies`.
-    squared_error, share : float
+    squared_error : float
+    share : (n_versions,) float64
         The error, or that share of the sum over all terms of the version, whichever is less.
     least : (n_versions,) float32
         Set for these versions: terms ``worth * size`` below may be left out. Infinite where all may, but the mean,
@@ -81,7 +82,7 @@ def least_of_versions(versions, sizes, energy, largest, squared_error, share, le
                 if some > 0:
                     lowest = np.int64(math.floor(2.0 * (of_size + np.float64(first + step)))) - _LOWEST
                     sums[min(max(lowest, 0), _CLASSES - 1) if step > 0 else 0] += square * some
-        allowed = min(squared_error, share * sums.sum())
+        allowed = min(squared_error, share[v] * sums.sum())
         total, found = 0.0, np.inf
         for c in range(_CLASSES):
             total += sums[c]

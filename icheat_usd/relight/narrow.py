@@ -118,7 +118,7 @@ class Narrow:
         begin = np.arange(0, len(radiance), _PIECE)
         pieces: I64 = np.stack([0 * begin, begin, np.minimum(begin + _PIECE, len(radiance))], axis=1)
         share = np.zeros((1, 4 * 16), np.float32)
-        proportions(pieces, radiance, self._radiance[light], share, rest, np.zeros((1, 2), np.float32))
+        proportions(pieces, radiance, self._radiance[light], share, rest, np.zeros((1, 4)))
         factors[light] *= share[0]
 
     def _compare(self, radiance: F32) -> Bool:

@@ -288,11 +288,27 @@ class Products:
         largest_channels(versions[large], self._versions, self._sizes)
         self._sizes[versions, 0] = np.inf  # means stay, however dark they are
 
-    def multiply(self, pairs: I64, pair_tile: I32, pair_version: I32, out: F32, narrow: bool = False) -> None:
-        """Products of some pairs of tile and version into ``out[:, pairs]``; `narrow`: with the narrowed rows.
+    def multiply(
+        self,
+        pairs: I64,
+        pair_tile: I32,
+        pair_version: I32,
+        out: F32,
+        narrow: bool = False,
+        part: F64 | None = None,
+    ) -> None:
+        """Products of some pairs of tile and version into ``out[:, pairs]``.
 
         Of a large transport, only the terms are read that are large in a version, seen beside the unedited light; see
         `LEFT_OUT_OF_VERSION`. Each version is seen alone, so that it does not matter which change together.
+
+        Parameters
+        ----------
+        narrow
+            With the narrowed rows.
+        part : (n_versions,)
+            Of squares of light at the cells, the share that versions have beside what is known of them; by default
+            nothing is known.
         """
         if not len(pairs):
             return
@@ -307,21 +323,21 @@ class Products:
         least = np.full(len(self._versions), np.finfo(np.float32).tiny, np.float32)
         has_few = None
         if self._large_terms is not None and not narrow:
-            self._find_least(np.unique(version), least)
+            self._find_least(np.unique(version), np.ones(len(least)) if part is None else part, least)
             has_few = ~self._is_large
         tiles.multiply(self._versions, self._sizes, least, tile, version, pairs, out, has_few)
 
-    def _find_least(self, versions: I64, least: F32) -> None:
+    def _find_least(self, versions: I64, part: F64, least: F32) -> None:
         """Least terms of some versions that count; of those with many cells a sample of all terms tells."""
         assert self._few_terms is not None and self._energy is not None
         error = LEFT_OUT_OF_VERSION**2 * self._shown
+        # Of a small part, a larger share is as much of the whole version.
+        share = np.minimum(LEFT_OUT_OF_ITSELF**2 / np.maximum(part, LEFT_OUT_OF_ITSELF**2), 1.0)
         is_large = self._is_large[versions]
         for v in versions[is_large]:
-            of_itself = self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES, LEFT_OUT_OF_ITSELF**2)
+            of_itself = self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES, float(share[v]))
             least[v] = max(of_itself, least[v])
-        least_of_versions(
-            versions[~is_large].astype(np.int64), self._sizes, *self._energy, error, LEFT_OUT_OF_ITSELF**2, least
-        )
+        least_of_versions(versions[~is_large].astype(np.int64), self._sizes, *self._energy, error, share, least)
 
     def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
         """Products of some tiles of uncompressed rows with values (n, 3) that are 0 but at some cells."""

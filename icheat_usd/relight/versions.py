@@ -301,20 +301,21 @@ class Versions:
         plain = np.array([v for v in stale if not self._is_by_pairs(v)], np.int64)
         known = np.array([v in self._known for v in plain], np.bool_)
         factors = np.zeros((self.n if known.any() else 0, LANES), np.float32)
-        rest, differs = self._deltas, ~known
+        rest, differs, part = self._deltas, ~known, np.ones(self.n)
         if known.any():
-            rest, size = np.empty_like(rest), np.zeros((self.n, 2), np.float32)
+            rest, size = np.empty_like(rest), np.zeros((self.n, 4))
             if not known.all():
                 rest[:] = self._deltas
             some = pieces[np.isin(pieces[:, 0], plain[known])]
             proportions(some, self._deltas, self._reference, factors, rest, size)
             differs |= size[plain, 0] > _ROUNDED * size[plain, 1]
+            np.divide(size[:, 2], size[:, 3], out=part, where=size[:, 3] > 0)
         self._products.prepare(plain[differs], tables, rest)
         if look is not None:
             look()
         take_back()
         self._multiply(self._pairs_of_some(plain[~known]))
-        self._multiply_rest(plain[known & differs], plain[known], factors)
+        self._multiply_rest(plain[known & differs], plain[known], factors, part)
         for v in stale:
             if self._is_by_pairs(v):
                 self._multiply_by_pairs(int(v))
@@ -332,8 +333,8 @@ class Versions:
     def _pairs_of_some(self, versions: I64) -> I64:
         return np.concatenate([np.empty(0, np.int64), *(self._pairs.of_version[v] for v in versions)])
 
-    def _multiply(self, pairs: I64, narrow: bool = False) -> None:
-        self._products.multiply(pairs, self._pairs.tile, self._pairs.version, self.values, narrow)
+    def _multiply(self, pairs: I64, narrow: bool = False, part: F64 | None = None) -> None:
+        self._products.multiply(pairs, self._pairs.tile, self._pairs.version, self.values, narrow, part)
 
     def _is_by_pairs(self, v: int) -> bool:
         version = self._versions[v]
@@ -343,17 +344,18 @@ class Versions:
         version = self._versions[v]
         return frozenset() if version is None else version.rows
 
-    def _multiply_rest(self, differ: I64, versions: I64, factors: F32) -> None:
+    def _multiply_rest(self, differ: I64, versions: I64, factors: F32, part: F64) -> None:
         """What is not like an earlier difference, and to that the exact products of the earlier one times factors.
 
-        Only those that `differ` by more than rounding have something to be multiplied.
+        Only those that `differ` by more than rounding have something to be multiplied; `part` as for
+        `Products.multiply`.
         """
         if not len(versions):
             return
         pairs = self._pairs_of_some(versions)
         if len(differ) < len(versions):
             self.values[:, pairs] = 0
-        self._multiply(self._pairs_of_some(differ), narrow=self._products.is_narrow)
+        self._multiply(self._pairs_of_some(differ), self._products.is_narrow, part)
         known, values = (array.reshape(*array.shape[:2], 4 * LANES) for array in (self._known_values, self.values))
         add_version_residuals(pairs, self._pairs.version, known, factors, values)
 

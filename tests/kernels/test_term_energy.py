@@ -35,7 +35,8 @@ def least_of(squared_error: float, versions: tuple[int, ...] = (0, 1, 2), share:
     sum_energies(index, worth, largest, energy)
     np.testing.assert_allclose(energy.sum(axis=1), np.bincount(index, worth.astype(np.float64) ** 2), rtol=1e-5)
     least = np.full(3, -1, np.float32)
-    least_of_versions(np.array(versions, np.int64), some_sizes(), energy, largest, squared_error, share, least)
+    shares = np.full(3, share)
+    least_of_versions(np.array(versions, np.int64), some_sizes(), energy, largest, squared_error, shares, least)
     return least
 
 
