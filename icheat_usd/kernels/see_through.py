@@ -18,6 +18,7 @@ _MAX_LAYERS = 256  # more count as opaque
 _INVALID = np.uint32(0xFFFFFFFF)
 # A surface is left behind by 2^-17 of its largest coordinate, twice what other rays start off it.
 _STEP = 2.0**-17
+_BEFORE_POINT = 1.0 - 1e-4  # as for other shadow rays: lights may lie in the plane of a pane
 
 
 @kernel
@@ -35,6 +36,84 @@ def _opacity(
     texel = texel_sum(texels, begin, width, height, wrap, image, s2, t2)
     return unit(np.float64(rescaled(texel, channel, scale, bias, m, OPACITY)[0]))
 
+
+@kernel
+def _cross_block(
+    function: int, scene: int, mesh_begin: np.ndarray, instance_mesh: np.ndarray, geometry: tuple, materials: tuple,
+    textures: tuple, origin: np.ndarray, direction: np.ndarray, limit: float, out: np.ndarray,
+) -> None:  # fmt: skip
+    """`cross_layers` by one thread."""
+    material, st, normals = geometry.material, geometry.st, geometry.normals
+    to_object = geometry.instance_to_object
+    opacities, thresholds, iors = materials.opacity, materials.opacity_threshold, materials.ior
+    texture, transform = materials.texture, materials.texture_transform
+    channel, scale, bias = materials.texture_channel, materials.texture_scale, materials.texture_bias
+    texels, begin, width, height, wrap = (
+        textures.texels,
+        textures.begin,
+        textures.width,
+        textures.height,
+        textures.wrap,
+    )
+    storage = np.empty(64, np.float32)
+    shift = np.int64((-storage.ctypes.data % 64) // 4)
+    ray = storage[shift : shift + 24]
+    words = ray.view(np.uint32)
+    for i in range(len(origin)):
+        near = 0.0
+        left = 1.0
+        layer = 0
+        d = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
+        length = math.sqrt(dot(d, d))
+        while left > 0.0 and length > 0.0:
+            for c in range(3):
+                ray[c] = origin[i, c]
+                ray[4 + c] = direction[i, c]
+            ray[3] = near
+            ray[7] = 0.0
+            ray[8] = limit
+            words[9] = _INVALID
+            words[10] = 0
+            words[11] = 0
+            words[17] = _INVALID
+            words[18] = _INVALID
+            words[19] = _INVALID
+            call_1(function, scene, ray.ctypes.data)
+            if words[18] == _INVALID:
+                break
+            instance = np.int64(words[18] if words[19] == _INVALID else words[19])
+            triangle = np.int64(mesh_begin[instance_mesh[instance]]) + np.int64(words[17])
+            u, v = np.float64(ray[15]), np.float64(ray[16])
+            weights = (1.0 - u - v, u, v)
+            m = np.int64(material[triangle])
+            opacity = _opacity(
+                m, triangle, weights, st, opacities, texture, transform, channel, scale, bias, texels, begin,
+                width, height, wrap,
+            )  # fmt: skip
+            ior = np.float64(iors[m])
+            if thresholds[m] > 0.0:
+                left *= 0.0 if opacity >= thresholds[m] else 1.0
+            elif opacity > 0.0:
+                left *= 1.0 - opacity
+            elif ior != 1.0 and ior > 0.0:
+                mean = mixed(
+                    corner(normals, triangle, 0),
+                    corner(normals, triangle, 1),
+                    corner(normals, triangle, 2),
+                    weights,
+                )
+                normal = normalized(transform_normal(to_object, instance, mean))
+                left *= 1.0 - dielectric_reflectance(abs(dot(normal, d)) / length, 1.0 / ior)[0]
+            largest = 0.0
+            for c in range(3):
+                largest = max(largest, abs(np.float64(origin[i, c]) + ray[8] * d[c]), abs(np.float64(origin[i, c])))
+            near = np.float64(ray[8]) + _STEP * largest / length
+            layer += 1
+            if layer >= _MAX_LAYERS:
+                left = 0.0
+            if near >= limit:
+                break
+        out[i] = left
 
 @parallel_kernel
 def cross_layers(
@@ -54,76 +133,72 @@ def cross_layers(
 
     `function` is the address of rtcIntersect1, `scene` that of the triangles that may let light through.
     """
-    material, st, normals = geometry.material, geometry.st, geometry.normals
-    to_object = geometry.instance_to_object
-    opacities, thresholds, iors = materials.opacity, materials.opacity_threshold, materials.ior
-    texture, transform = materials.texture, materials.texture_transform
-    channel, scale, bias = materials.texture_channel, materials.texture_scale, materials.texture_bias
-    texels, begin, width, height, wrap = (
-        textures.texels,
-        textures.begin,
-        textures.width,
-        textures.height,
-        textures.wrap,
-    )
     n = len(origin)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
-        storage = np.empty(64, np.float32)
-        shift = np.int64((-storage.ctypes.data % 64) // 4)
-        ray = storage[shift : shift + 24]
-        words = ray.view(np.uint32)
-        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            near = 0.0
-            left = 1.0
-            layer = 0
-            d = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
-            length = math.sqrt(dot(d, d))
-            while left > 0.0 and length > 0.0:
+        some = slice(block * _BLOCK, (block + 1) * _BLOCK)
+        _cross_block(
+            function, scene, mesh_begin, instance_mesh, geometry, materials, textures, origin[some], direction[some],
+            limit, out[some],
+        )  # fmt: skip
+
+
+@parallel_kernel
+def dim_places(
+    function: int,
+    scene: int,
+    mesh_begin: np.ndarray,
+    instance_mesh: np.ndarray,
+    geometry: tuple,
+    materials: tuple,
+    textures: tuple,
+    points: np.ndarray,
+    distant: bool,
+    place: np.ndarray,
+    row: np.ndarray,
+    runs: np.ndarray,
+    through: np.ndarray,
+    crossing: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Dim what places get through see-through surfaces, after `kernels.shadow.light_places`.
+
+    Parameters
+    ----------
+    function, scene
+        As for `cross_layers`.
+    points : (n_points, at least 3) float32
+        Where the light's points are; of distant ones the direction.
+    distant, place, row, through, out
+        As `light_places` has them; `out` is changed.
+    runs : (n_runs,) int32
+        Runs of places that are meant.
+    crossing : (n,) float32
+        Share of light that crosses. Set where a ray was sent, taken as it is where none was.
+    """
+    n_places, limit = place.shape[2], np.inf if distant else _BEFORE_POINT
+    for i in prange(len(runs)):
+        first = np.int64(runs[i]) * n_places
+        last = min(first + n_places, len(row))
+        origin, direction = np.empty((n_places, 3), np.float32), np.empty((n_places, 3), np.float32)
+        share, n = np.empty(n_places, np.float32), 0
+        for k in range(first, last):
+            if through[k] > 0:
                 for c in range(3):
-                    ray[c] = origin[i, c]
-                    ray[4 + c] = direction[i, c]
-                ray[3] = near
-                ray[7] = 0.0
-                ray[8] = limit
-                words[9] = _INVALID
-                words[10] = 0
-                words[11] = 0
-                words[17] = _INVALID
-                words[18] = _INVALID
-                words[19] = _INVALID
-                call_1(function, scene, ray.ctypes.data)
-                if words[18] == _INVALID:
-                    break
-                instance = np.int64(words[18] if words[19] == _INVALID else words[19])
-                triangle = np.int64(mesh_begin[instance_mesh[instance]]) + np.int64(words[17])
-                u, v = np.float64(ray[15]), np.float64(ray[16])
-                weights = (1.0 - u - v, u, v)
-                m = np.int64(material[triangle])
-                opacity = _opacity(
-                    m, triangle, weights, st, opacities, texture, transform, channel, scale, bias, texels, begin,
-                    width, height, wrap,
-                )  # fmt: skip
-                ior = np.float64(iors[m])
-                if thresholds[m] > 0.0:
-                    left *= 0.0 if opacity >= thresholds[m] else 1.0
-                elif opacity > 0.0:
-                    left *= 1.0 - opacity
-                elif ior != 1.0 and ior > 0.0:
-                    mean = mixed(
-                        corner(normals, triangle, 0),
-                        corner(normals, triangle, 1),
-                        corner(normals, triangle, 2),
-                        weights,
-                    )
-                    normal = normalized(transform_normal(to_object, instance, mean))
-                    left *= 1.0 - dielectric_reflectance(abs(dot(normal, d)) / length, 1.0 / ior)[0]
-                largest = 0.0
-                for c in range(3):
-                    largest = max(largest, abs(np.float64(origin[i, c]) + ray[8] * d[c]), abs(np.float64(origin[i, c])))
-                near = np.float64(ray[8]) + _STEP * largest / length
-                layer += 1
-                if layer >= _MAX_LAYERS:
-                    left = 0.0
-                if near >= limit:
-                    break
-            out[i] = left
+                    origin[n, c] = place[runs[i], c, k - first]
+                    end = points[through[k] - 1, c]
+                    direction[n, c] = end if distant else end - origin[n, c]
+                n += 1
+        if n > 0:
+            _cross_block(
+                function, scene, mesh_begin, instance_mesh, geometry, materials, textures, origin[:n], direction[:n],
+                limit, share[:n],
+            )  # fmt: skip
+        n = 0
+        for k in range(first, last):
+            if through[k] == 0:
+                continue
+            if through[k] > 0:
+                crossing[k] = share[n]
+                n += 1
+            for c in range(3):
+                out[row[k], c] *= crossing[k]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
-from icheat_usd.kernels.see_through import cross_layers
+from icheat_usd.kernels.see_through import cross_layers, dim_places
 from icheat_usd.kernels.shadow import GLOSS, PART, SHARED_PART, STRIDE, TURNED, light_places, tell_points
 from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.kernels.shaping import shape_places
@@ -47,22 +47,24 @@ class Shadows:
         """Share of light (n,) that crosses the see-through triangles up to `limit`; see `tracing.transmittance`."""
         out = np.ones(len(origin), np.float32)
         if self.passing is not None:
-            function, scene = self.passing.address_of("rtcIntersect1")
-            geometry = snapshot.geometry
-            cross_layers(
-                function,
-                scene,
-                geometry.mesh_begin,
-                geometry.instance_mesh,
-                geometry,
-                snapshot.materials,
-                snapshot.textures,
-                np.ascontiguousarray(origin, np.float32),
-                np.ascontiguousarray(direction, np.float32),
-                limit,
-                out,
-            )
+            ends = np.ascontiguousarray(origin, np.float32), np.ascontiguousarray(direction, np.float32)
+            cross_layers(*self._layers(snapshot), *ends, limit, out)
         return out
+
+    def dim(
+        self, snapshot: SceneSnapshot, shining: Shining, places: Places, runs: I32, through: I32, crossing: F32, out: F32
+    ) -> None:
+        """Dim what places of some runs get through see-through surfaces; see `kernels.see_through.dim_places`."""
+        if self.passing is not None:
+            light = shining.table, shining.distant
+            dim_places(*self._layers(snapshot), *light, places.place, places.row, runs, through, crossing, out)
+
+    def _layers(self, snapshot: SceneSnapshot) -> tuple[Any, ...]:
+        """What kernels need to find the surfaces on a ray's way."""
+        assert self.passing is not None
+        geometry = snapshot.geometry
+        surfaces = geometry.mesh_begin, geometry.instance_mesh, geometry, snapshot.materials, snapshot.textures
+        return *self.passing.address_of("rtcIntersect1"), *surfaces
 
 
 def build_shadows(snapshot: SceneSnapshot, tracer: EmbreeTracer, hidden: Bool | None = None) -> Shadows:
@@ -324,26 +326,13 @@ class Look:
             self._out,
             self._through,
         )
+        if len(self._through):
+            shadows.dim(self._snapshot, self._shining, places, runs, self._through, self._crossing, self._out)
 
-    def finish(self, runs: I32 | None = None) -> None:
-        """Dim what is lit: see-through surfaces, the light's shaping, and surfaces that it does not light.
-
-        All `runs` (n_runs,) that are meant, by default every one, have to be lit before.
-        """
+    def finish(self) -> None:
+        """Dim all that is lit: the light's shaping, and surfaces that it does not light. Every run is lit before."""
         snapshot, places, out = self._snapshot, self._places, self._out
         table, distant = self._shining.table, self._shining.distant
-        if len(self._through):
-            if runs is None:
-                rows = np.flatnonzero(self._through != 0)  # of bool, several times as fast
-            else:
-                rows = (runs[:, None].astype(np.int64) * RUN + np.arange(RUN)).ravel()
-                rows = rows[rows < places.n]
-                rows = rows[self._through[rows] != 0]
-            sent = rows[self._through[rows] > 0]
-            origin, end = places.place[sent // RUN, :3, sent % RUN], table[self._through[sent] - 1, :3]
-            direction, limit = (end, np.inf) if distant else (end - origin, 1.0 - 1e-4)
-            self._crossing[sent] = self._shadows.crossing(snapshot, origin, direction, limit)
-            out[places.row[rows]] *= self._crossing[rows, None]
         shaping = snapshot.controls(0).shaping
         if shaping is not None:
             # The choice among points was made without it, which the mean over choices does not notice.
@@ -424,4 +413,4 @@ def direct_at(
     shining = shining or shining_points(snapshot, seed)
     look = Look(snapshot, shadows, places, shining, seed, share_rays, out, turn, last, told)
     look.light(np.arange(len(places.place), dtype=np.int32) if runs is None else runs)
-    look.finish(runs)
+    look.finish()

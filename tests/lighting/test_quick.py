@@ -140,8 +140,8 @@ def test_a_light_that_moves_finds_its_shadows_within_a_round_of_looks(
     """Near the look before a part of the rays is enough, also of those through glass and leaves; where the light then
     stays, none of what was kept is old."""
     crossed: list[int] = []
-    crossing = Shadows.crossing
-    monkeypatch.setattr(Shadows, "crossing", lambda *a: (crossed.append(len(a[2])), crossing(*a))[1])
+    dim = Shadows.dim
+    monkeypatch.setattr(Shadows, "dim", lambda *a: (crossed.append(int((a[5] > 0).sum())), dim(*a))[1])
     first = scene(LIGHTS["rect"], Material(0.5))
     points = on_floor(first, 3000)
     order = np.lexsort((points.position[:, 0], np.floor(points.position[:, 2] * 20)))
