@@ -10,10 +10,12 @@ from numba import prange
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.bsdf import dielectric_reflectance
 from icheat_usd.kernels.embree import call_1
+from icheat_usd.kernels.shadow_lanes import ORIGIN
 from icheat_usd.kernels.surface import OPACITY, corner, corner_pair, mixed, rescaled, texel_sum, unit
 from icheat_usd.kernels.vector import dot, normalized, transform_normal
 
 _BLOCK = 64
+_RUNS = 16  # of places, whose rays are looked at together
 _MAX_LAYERS = 256  # more count as opaque
 _INVALID = np.uint32(0xFFFFFFFF)
 # A surface is left behind by 2^-17 of its largest coordinate, twice what other rays start off it.
@@ -115,6 +117,7 @@ def _cross_block(
                 break
         out[i] = left
 
+
 @parallel_kernel
 def cross_layers(
     function: int,
@@ -142,6 +145,57 @@ def cross_layers(
         )  # fmt: skip
 
 
+@kernel
+def _find_crossed(runs: np.ndarray, size: int, through: np.ndarray, found: np.ndarray) -> tuple[int, int]:
+    """Those of some runs behind see-through surfaces, to `found`; how many, and from how many places a ray was sent."""
+    n = n_sent = 0
+    for run in runs:
+        first = np.int64(run) * size
+        any_of, sent = np.int32(0), 0
+        for value in through[first : first + size]:
+            any_of |= value
+            sent += 1 if value > 0 else 0
+        found[n] = first
+        n += 1 if any_of != 0 else 0
+        n_sent += sent
+    return n, n_sent
+
+
+@kernel
+def _find_ways(
+    first: np.ndarray, points: np.ndarray, distant: bool, columns: np.ndarray, column: np.ndarray, through: np.ndarray,
+    origin: np.ndarray, direction: np.ndarray,
+) -> None:  # fmt: skip
+    """Rays that were sent from places of runs, of which the `first` ones are given, into `origin` and `direction`."""
+    size, n = columns.shape[1], 0
+    for begin in first:
+        for k, value in enumerate(through[begin : begin + size]):
+            if value > 0:
+                for c in range(3):
+                    origin[n, c] = columns[column[begin // size, ORIGIN + c], k]
+                    end = points[value - 1, c]
+                    direction[n, c] = end if distant else end - origin[n, c]
+                n += 1
+
+
+@kernel
+def _dim(
+    first: np.ndarray, size: int, share: np.ndarray, row: np.ndarray, through: np.ndarray, crossing: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
+    """Dim the places of runs, of which the `first` ones are given; `share` (n_sent,) is what the rays found."""
+    n = 0
+    for begin in first:
+        for k, value in enumerate(through[begin : begin + size]):
+            if value == 0:
+                continue
+            if value > 0:
+                crossing[begin + k] = share[n]
+                n += 1
+            for c in range(3):
+                out[row[begin + k], c] *= crossing[begin + k]
+
+
 @parallel_kernel
 def dim_places(
     function: int,
@@ -153,7 +207,8 @@ def dim_places(
     textures: tuple,
     points: np.ndarray,
     distant: bool,
-    place: np.ndarray,
+    columns: np.ndarray,
+    column: np.ndarray,
     row: np.ndarray,
     runs: np.ndarray,
     through: np.ndarray,
@@ -168,37 +223,22 @@ def dim_places(
         As for `cross_layers`.
     points : (n_points, at least 3) float32
         Where the light's points are; of distant ones the direction.
-    distant, place, row, through, out
+    distant, columns, column, row, through, out
         As `light_places` has them; `out` is changed.
     runs : (n_runs,) int32
         Runs of places that are meant.
     crossing : (n,) float32
         Share of light that crosses. Set where a ray was sent, taken as it is where none was.
     """
-    n_places, limit = place.shape[2], np.inf if distant else _BEFORE_POINT
-    for i in prange(len(runs)):
-        first = np.int64(runs[i]) * n_places
-        last = min(first + n_places, len(row))
-        origin, direction = np.empty((n_places, 3), np.float32), np.empty((n_places, 3), np.float32)
-        share, n = np.empty(n_places, np.float32), 0
-        for k in range(first, last):
-            if through[k] > 0:
-                for c in range(3):
-                    origin[n, c] = place[runs[i], c, k - first]
-                    end = points[through[k] - 1, c]
-                    direction[n, c] = end if distant else end - origin[n, c]
-                n += 1
-        if n > 0:
-            _cross_block(
-                function, scene, mesh_begin, instance_mesh, geometry, materials, textures, origin[:n], direction[:n],
-                limit, share[:n],
-            )  # fmt: skip
-        n = 0
-        for k in range(first, last):
-            if through[k] == 0:
-                continue
-            if through[k] > 0:
-                crossing[k] = share[n]
-                n += 1
-            for c in range(3):
-                out[row[k], c] *= crossing[k]
+    size, limit = columns.shape[1], np.inf if distant else _BEFORE_POINT
+    for block in prange((len(runs) + _RUNS - 1) // _RUNS):
+        first = np.empty(_RUNS, np.int64)
+        n_runs, n = _find_crossed(runs[block * _RUNS : (block + 1) * _RUNS], size, through, first)
+        if n_runs == 0:
+            continue
+        origin, direction, share = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32)
+        _find_ways(first[:n_runs], points, distant, columns, column, through, origin, direction)
+        _cross_block(
+            function, scene, mesh_begin, instance_mesh, geometry, materials, textures, origin, direction, limit, share
+        )
+        _dim(first[:n_runs], size, share, row, through, crossing, out)

@@ -25,11 +25,20 @@ from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.embree import PACKET, call_packet
 from icheat_usd.kernels.lanes import minus, where_above
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
-from icheat_usd.kernels.shadow_lanes import CANDIDATE, RUN, look, shine
+from icheat_usd.kernels.shadow_lanes import (
+    CANDIDATE,
+    COLUMNS,
+    EDGE,
+    ORIGIN,
+    RUN,
+    SPECULAR,
+    TINT,
+    look,
+    shine,
+)
 from icheat_usd.kernels.simd import address_of, fetch, load, multiply_add, plus, product, spread, store
 
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
-PLACE, TINT, GLOSS = 9, 3, 12  #: columns of the tables of places
 PART = 8  #: one of so many places of a run sends a ray where all have met the same so far, and that is enough
 SHARED_PART = 16  #: the same of runs whose places share rays, of which nothing is told to others
 _MIXED_PART = 4  # the same of other runs, of those behind glass and leaves, and of those that nothing is known of
@@ -87,8 +96,9 @@ def _prepare_packet(rays: np.ndarray) -> None:
 
 @kernel
 def _trace(
-    function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, runs: np.ndarray,
-    found: np.ndarray, rays: np.ndarray, valid: np.ndarray, rows: np.ndarray, n: int, state: np.ndarray,
+    function: int, arguments: int, opaque: int, passing: int, distant: bool, columns: np.ndarray, column: np.ndarray,
+    runs: np.ndarray, found: np.ndarray, rays: np.ndarray, valid: np.ndarray, rows: np.ndarray, n: int,
+    state: np.ndarray,
 ) -> None:  # fmt: skip
     """Shadow rays of the first `n` rows of some runs, in packets of 16; their `state` is set."""
     limit = np.float32(np.inf) if distant else _STOP_SHORT
@@ -98,7 +108,7 @@ def _trace(
             valid[lane] = -1 if lane < count else 0
             k, j = divmod(np.uint32(rows[begin + min(lane, count - 1)]), np.uint32(RUN))
             for c in range(3):
-                rays[c, lane] = place[runs[k], c, j]
+                rays[c, lane] = columns[column[runs[k], ORIGIN + c], j]
                 rays[4 + c, lane] = found[k, c, j]
             rays[8, lane] = limit
         call_packet(function, address_of(valid), opaque, address_of(rays), arguments)
@@ -211,21 +221,22 @@ def _append_rows(asks: np.ndarray, offset: int, count: int, rows: np.ndarray) ->
 
 @kernel
 def _meet(
-    function: int, arguments: int, opaque: int, passing: int, distant: bool, place: np.ndarray, runs: np.ndarray,
-    found: np.ndarray, rays: np.ndarray, valid: np.ndarray, chosen: np.ndarray, share_rays: bool, phase: int,
-    known: np.ndarray, told: np.ndarray, state: np.ndarray,
+    function: int, arguments: int, opaque: int, passing: int, distant: bool, columns: np.ndarray, column: np.ndarray,
+    runs: np.ndarray, found: np.ndarray, rays: np.ndarray, valid: np.ndarray, chosen: np.ndarray, share_rays: bool,
+    phase: int, known: np.ndarray, told: np.ndarray, state: np.ndarray,
 ) -> None:  # fmt: skip
     """Find what is between the places of some runs and their points, `chosen` (n_runs, RUN)."""
     n = len(runs)
     asks, begin = np.empty((n, RUN), np.int32), np.zeros(n + 1, np.int64)
     rows, others = np.empty(n * RUN + 1, np.int32), np.empty(n * RUN + 1, np.int32)
     every_state, alike = state.reshape(-1), np.empty(n, np.int64)
+    way = function, arguments, opaque, passing, distant, columns, column, runs, found, rays, valid
     for k in range(n):
         knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
         alike[k] = _alike(knows, told)
         _ask(chosen[k], share_rays, phase, knows, told, alike[k], state[k], asks[k])
         begin[k + 1] = _append_rows(asks[k], k * RUN, begin[k], rows)
-    _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, rows, begin[n], every_state)
+    _trace(*way, rows, begin[n], every_state)
     count = 0
     for k in range(n):
         offset = k * RUN
@@ -236,7 +247,7 @@ def _meet(
             for j in range(RUN):
                 asks[k, j] = 1 if doubted >> j // _BESIDE & 1 != 0 and chosen[k, j] >= 0 and asks[k, j] == 0 else 0
             count = _append_rows(asks[k], offset, count, others)
-    _trace(function, arguments, opaque, passing, distant, place, runs, found, rays, valid, others, count, every_state)
+    _trace(*way, others, count, every_state)
 
 
 @kernel
@@ -277,12 +288,12 @@ def tell_points(
 
 @kernel
 def _reflect(
-    colors: np.ndarray, here: int, tint: int, gloss: int, found: np.ndarray, chosen: np.ndarray, state: np.ndarray,
-    room: int,
+    colors: np.ndarray, at: np.ndarray, has_lobe: bool, diffuse: np.float32, specular: np.float32, found: np.ndarray,
+    chosen: np.ndarray, state: np.ndarray, room: int,
 ) -> None:  # fmt: skip
     """What the places of a run reflect, into the first three rows of `found`.
 
-    Addresses of the run's columns; `gloss` 0: no place has a lobe. `room` has place for 32 floats.
+    `at` as for `look`; `room` is an address with place for 32 floats.
     """
     levels, n_lit = found[3], np.int32(0)
     for j in range(RUN):
@@ -291,19 +302,20 @@ def _reflect(
     if n_lit == 0:
         found[:3] = _ZERO
         return
-    start = address_of(found)
+    start, of_diffuse, of_specular = address_of(found), spread(diffuse), spread(specular)
     for lane in range(0, RUN, 16):
-        if gloss != 0:
-            shine(gloss, here, lane, start, room)
-        at = start + lane * 4
-        level = load(at + RUN * 12)
+        skip = lane * 4
+        base = edge = of_specular
+        if has_lobe:
+            shine(at, lane, start, room)
+            base, edge = product(load(room), of_specular), product(load(room + 64), of_specular)
+        level = load(start + skip + RUN * 12)
         for c in range(3):
-            column = (c * RUN + lane) * 4
-            reflects = load(tint + column)
-            if gloss != 0:
-                reflects = multiply_add(load(gloss + column), load(room), reflects)
-                reflects = multiply_add(load(gloss + column + RUN * 12), load(room + 64), reflects)
-            store(at + c * RUN * 4, product(reflects, level))
+            reflects = product(load(at[TINT + c] + skip), of_diffuse)
+            if has_lobe:
+                reflects = multiply_add(load(at[SPECULAR + c] + skip), base, reflects)
+                reflects = multiply_add(load(at[EDGE + c] + skip), edge, reflects)
+            store(start + skip + c * RUN * 4, product(reflects, level))
     if len(colors) > 0:
         for j in range(RUN):
             if chosen[j] >= 0:
@@ -327,20 +339,29 @@ def _get_nothing(run: int, row: np.ndarray, out: np.ndarray, through: np.ndarray
 
 
 @kernel
-def _fetch_run(table: int, run: int, n_columns: int) -> None:
-    """Ask for the columns of a run, from the address of a table, before they are needed."""
-    begin = table + run * (n_columns * RUN * 4)
-    for line in range(n_columns * RUN // 16):
-        fetch(begin + line * 64)
+def _find_columns(columns: int, column: np.ndarray, run: int, at: np.ndarray) -> None:
+    """Addresses of the columns of a run, from that of all."""
+    for c in range(COLUMNS):
+        at[c] = columns + np.int64(column[run, c]) * (RUN * 4)
+
+
+@kernel
+def _fetch_columns(columns: int, column: np.ndarray, run: int, other: int, first: int, end: int) -> None:
+    """Ask for some columns of a run before they are needed, but for those that another run shares."""
+    for c in range(first, end):
+        if column[run, c] != column[other, c]:
+            begin = columns + np.int64(column[run, c]) * (RUN * 4)
+            for line in range(RUN // 16):
+                fetch(begin + line * 64)
 
 
 @kernel
 def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
-    colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray, place: np.ndarray,
-    tint: np.ndarray, gloss: np.ndarray, lobes: np.ndarray, share_rays: bool, phase: int, known: np.ndarray,
-    told: np.ndarray, row: np.ndarray, wanted: np.ndarray, out: np.ndarray, through: np.ndarray, first: int,
-    last: int,
+    colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray,
+    columns: np.ndarray, column: np.ndarray, lobes: np.ndarray, diffuse: np.float32, specular: np.float32, share_rays: bool,
+    phase: int, known: np.ndarray, told: np.ndarray, row: np.ndarray, wanted: np.ndarray, out: np.ndarray,
+    through: np.ndarray, first: int, last: int,
 ) -> None:  # fmt: skip
     """`light_places` for those runs that are `wanted` from number `first` up to `last`."""
     n, candidates, width = last - first, points.shape[0], points.shape[2]
@@ -354,7 +375,8 @@ def _light_runs(
     valid = storage[begin : begin + 16].view(np.int32)
     room = address_of(storage) + (begin + 16) * 4
     chosen, state = np.empty((n, RUN), np.int32), np.empty((n, RUN), np.int32)
-    runs = np.empty(n, np.int64)
+    runs, at = np.empty(n, np.int64), np.empty(COLUMNS, np.int64)
+    every_column, before = address_of(columns), np.int64(wanted[first])
     numbers = np.empty(RUN, np.float32)
     for j in range(RUN):
         # multiples of the golden ratio are spread evenly, modulo 1, however many of them there are
@@ -365,37 +387,37 @@ def _light_runs(
     n = 0
     for i in range(first, last):
         run = np.int64(wanted[i])
-        # Tables of runs stream by once a frame, and the next is asked for while this one is looked at.
-        _fetch_run(address_of(place), np.int64(wanted[min(i + 1, last - 1)]), PLACE)
-        _fetch_run(address_of(tint), run, TINT)
+        # Columns stream by once a frame, and those of the next run are asked for while this one is looked at.
+        _fetch_columns(every_column, column, np.int64(wanted[min(i + 1, last - 1)]), run, ORIGIN, TINT)
         if is_turned_away(bounds[run], light, distant):
             _get_nothing(run, row, out, through, known)
             continue
+        _fetch_columns(every_column, column, run, before, TINT, COLUMNS)
+        _find_columns(every_column, column, run, at)
+        before = run
         k, runs[n] = n, run
         n += 1
         offset = np.int64(hash_u32(np.uint32(run) ^ np.uint32(seed))) & (groups - 1)
         shift = spread(to_unit(hash_u32(np.uint32(of_turn) ^ np.uint32(run))))
-        here, size = address_of(place) + run * (PLACE * RUN * 4), min(RUN, len(row) - run * RUN)
+        size = min(RUN, len(row) - run * RUN)
         for lane in range(0, RUN, 16):
             number = plus(load(address_of(numbers) + lane * 4), shift)
             number = where_above(number, below_one, minus(number, one), number)
             look(
-                address_of(points) + offset * 4, width, candidates, distant, here, lane, number, room,
+                address_of(points) + offset * 4, width, candidates, distant, at, lane, number, room,
                 address_of(found[k]), address_of(chosen[k]),
             )  # fmt: skip
         for j in range(RUN):
             chosen[k, j] = first_point[offset + j] + chosen[k, j] if chosen[k, j] >= 0 else -1
         chosen[k, size:] = -1
     _meet(
-        function, arguments, opaque, passing, distant, place, runs[:n], found, rays, valid, chosen, share_rays, phase,
-        known, told, state,
+        function, arguments, opaque, passing, distant, columns, column, runs[:n], found, rays, valid, chosen,
+        share_rays, phase, known, told, state,
     )  # fmt: skip
     for k in range(n):
         run = runs[k]
-        lobe = np.int64(lobes[run])
-        of_lobe = address_of(gloss) + lobe * (GLOSS * RUN * 4) if lobe >= 0 else 0
-        here, of_tint = address_of(place) + run * (PLACE * RUN * 4), address_of(tint) + run * (TINT * RUN * 4)
-        _reflect(colors, here, of_tint, of_lobe, found[k], chosen[k], state[k], room)
+        _find_columns(every_column, column, run, at)
+        _reflect(colors, at, lobes[run] != 0, diffuse, specular, found[k], chosen[k], state[k], room)
         red, green, blue, of_run = found[k, 0], found[k, 1], found[k, 2], run * RUN
         size = min(RUN, len(row) - of_run)
         for j in range(size):
@@ -427,10 +449,11 @@ def light_places(
     seed: int,
     turn: int,
     bounds: np.ndarray,
-    place: np.ndarray,
-    tint: np.ndarray,
-    gloss: np.ndarray,
+    columns: np.ndarray,
+    column: np.ndarray,
     lobes: np.ndarray,
+    diffuse: np.float32,
+    specular: np.float32,
     share_rays: bool,
     phase: int,
     known: np.ndarray,
@@ -442,7 +465,7 @@ def light_places(
 ) -> None:
     """What n places reflect of one light.
 
-    Places come in runs of `RUN`, each a table with a row per property; the last run is filled up.
+    Places come in runs of `RUN`, with a column for each property; the last run is filled up.
 
     Parameters
     ----------
@@ -460,13 +483,11 @@ def light_places(
     turn : int
         Number of the ray of each place.
     bounds : (n_runs, 4, 3) float32, least and largest origin of a run, and least and largest geometric normal
-    place : (n_runs, `PLACE`, `RUN`) float32
-        Origin off the surface, geometric normal, shading normal.
-    tint : (n_runs, `TINT`, `RUN`) float32, albedo over pi
-    gloss : (n_lobed, `GLOSS`, `RUN`) float32
-        specular, specular_edge, alpha (0: no lobe), cosine to the eye, Smith's Lambda of the eye, direction to the
-        eye; for runs with a place that has a lobe.
-    lobes : (n_runs,) int32, number of the run in `gloss`; -1: no place has a lobe
+    columns : (n_columns, `RUN`) float32
+    column : (n_runs, `COLUMNS`) int32
+        Number of each of a run's columns, as `shadow_lanes` names them; runs may share some.
+    lobes : (n_runs,) bool, whether a place of the run has a lobe
+    diffuse, specular : float32, factors of what places reflect
     share_rays : bool
         Rays of a part of the places stand for a whole run where all agree: for places in the order of tiles.
         Shadows that fall between those rays are missed.
@@ -494,6 +515,6 @@ def light_places(
         task = 2 * turn_of if turn_of < half else 2 * (turn_of - half) + 1
         _light_runs(
             function, arguments, opaque, passing, points, first_point, colors, light, distant, seed, turn, bounds,
-            place, tint, gloss, lobes, share_rays, phase, known, told, row, wanted, out, through, task * _RUNS,
-            min(n_runs, (task + 1) * _RUNS),
+            columns, column, lobes, diffuse, specular, share_rays, phase, known, told, row, wanted, out, through,
+            task * _RUNS, min(n_runs, (task + 1) * _RUNS),
         )  # fmt: skip

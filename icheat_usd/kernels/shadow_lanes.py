@@ -12,6 +12,12 @@ from icheat_usd.kernels.lanes import minus, ratio, root, store_whole, where_abov
 from icheat_usd.kernels.simd import load, multiply_add, plus, product, spread, store, zeros
 
 RUN = 64  #: successive places that share shadow rays if that is allowed
+#: Columns of a run of places, one number for each: origin off the surface, geometric normal, shading normal, albedo
+#: over pi; and where a place has a lobe, `specular`, `specular_edge`, alpha (0: no lobe), cosine to the eye, Smith's
+#: Lambda of the eye, direction to the eye. The first ones of three, or the one.
+ORIGIN, NORMAL, SHADING, TINT = 0, 3, 6, 9
+SPECULAR, EDGE, ALPHA, COSINE, LAMBDA, EYE = 12, 15, 18, 19, 20, 21
+COLUMNS = 24  #: of a run
 POINT = 7  #: columns of the table of points that are looked at for every place
 #: Floats that `look` needs for each candidate of 16 places.
 CANDIDATE = 64
@@ -20,23 +26,24 @@ _ONE = np.float32(1.0)
 
 @kernel
 def look(
-    points: int, width: int, candidates: int, distant: bool, place: int, lane: int, number: Any, room: int,
+    points: int, width: int, candidates: int, distant: bool, at: np.ndarray, lane: int, number: Any, room: int,
     found: int, choice_of: int,
 ) -> None:  # fmt: skip
     """What 16 places of a run, from number `lane`, get from their candidates, and which they would send a ray to.
 
     Parameters
     ----------
-    points, place, room, found, choice_of : addresses
-        Of the columns of the first place's candidates, each `width` floats long; of the run's columns; of `CANDIDATE`
-        floats for each candidate; of the run's rows of what is found: direction to the chosen point (for distant
-        lights) or way to it, and light; and of the number of each place's chosen candidate, int32.
+    points, room, found, choice_of : addresses
+        Of the columns of the first place's candidates, each `width` floats long; of `CANDIDATE` floats for each
+        candidate; of the run's rows of what is found: direction to the chosen point (for distant lights) or way to it,
+        and light; and of the number of each place's chosen candidate, int32.
+    at : (`COLUMNS`,) int64, addresses of the run's columns
     number : 16 random numbers
     """
-    step, at, out = width * 4, place + lane * 4, found + lane * 4
-    x, y, z = load(at), load(at + RUN * 4), load(at + RUN * 8)
-    gx, gy, gz = load(at + RUN * 12), load(at + RUN * 16), load(at + RUN * 20)
-    nx, ny, nz = load(at + RUN * 24), load(at + RUN * 28), load(at + RUN * 32)
+    step, skip, out = width * 4, lane * 4, found + lane * 4
+    x, y, z = load(at[ORIGIN] + skip), load(at[ORIGIN + 1] + skip), load(at[ORIGIN + 2] + skip)
+    gx, gy, gz = load(at[NORMAL] + skip), load(at[NORMAL + 1] + skip), load(at[NORMAL + 2] + skip)
+    nx, ny, nz = load(at[SHADING] + skip), load(at[SHADING + 1] + skip), load(at[SHADING + 2] + skip)
     none, total = zeros(), zeros()
     for c in range(candidates):
         point, kept = points + (c * POINT * width + lane) * 4, room + c * CANDIDATE * 4
@@ -87,26 +94,26 @@ def _if_reached(weight: Any, begin: Any, wanted: Any, new: Any, old: Any) -> Any
 
 
 @kernel
-def shine(gloss: int, place: int, lane: int, found: int, room: int) -> None:
+def shine(at: np.ndarray, lane: int, found: int, room: int) -> None:
     """Factors of `specular` and `specular_edge` of 16 places of a run: the GGX lobe of `kernels.bsdf.specular_terms`.
 
-    Addresses as those of `look`; `gloss` of the run's columns; the factors go to `room`, 16 floats each.
+    `at`, `lane` and `found` as for `look`; the factors go to the address `room`, 16 floats each.
     """
-    lobe, at, way = gloss + lane * 4, place + lane * 4, found + lane * 4
-    nx, ny, nz = load(at + RUN * 24), load(at + RUN * 28), load(at + RUN * 32)
+    skip, way = lane * 4, found + lane * 4
+    nx, ny, nz = load(at[SHADING] + skip), load(at[SHADING + 1] + skip), load(at[SHADING + 2] + skip)
     lx, ly, lz = load(way), load(way + RUN * 4), load(way + RUN * 8)
     none, one = zeros(), spread(_ONE)
     inverse = ratio(one, root(multiply_add(lx, lx, multiply_add(ly, ly, product(lz, lz)))))
     lx, ly, lz = product(lx, inverse), product(ly, inverse), product(lz, inverse)
     light = multiply_add(nx, lx, multiply_add(ny, ly, product(nz, lz)))
-    hx, hy, hz = plus(lx, load(lobe + RUN * 36)), plus(ly, load(lobe + RUN * 40)), plus(lz, load(lobe + RUN * 44))
+    hx, hy, hz = plus(lx, load(at[EYE] + skip)), plus(ly, load(at[EYE + 1] + skip)), plus(lz, load(at[EYE + 2] + skip))
     inverse = ratio(one, root(multiply_add(hx, hx, multiply_add(hy, hy, product(hz, hz)))))
     hx, hy, hz = product(hx, inverse), product(hy, inverse), product(hz, inverse)
     cosine = multiply_add(nx, hx, multiply_add(ny, hy, product(nz, hz)))
     # the sine from the cross product, as of a narrow lobe 1 - cos^2 has no digits
     sx, sy = minus(product(ny, hz), product(nz, hy)), minus(product(nz, hx), product(nx, hz))
     sz = minus(product(nx, hy), product(ny, hx))
-    alpha = load(lobe + RUN * 24)
+    alpha = load(at[ALPHA] + skip)
     alpha2 = product(alpha, alpha)
     sine2 = multiply_add(sx, sx, multiply_add(sy, sy, product(sz, sz)))
     width = multiply_add(alpha2, product(cosine, cosine), sine2)
@@ -114,7 +121,7 @@ def shine(gloss: int, place: int, lane: int, found: int, room: int) -> None:
     c2 = where_above(c2, one, one, c2)
     smith = root(multiply_add(alpha2, ratio(minus(one, c2), c2), one))
     smith = product(spread(np.float32(0.5)), minus(smith, one))
-    below = product(plus(plus(one, load(lobe + RUN * 32)), smith), product(load(lobe + RUN * 28), light))
+    below = product(plus(plus(one, load(at[LAMBDA] + skip)), smith), product(load(at[COSINE] + skip), light))
     below = product(below, product(product(width, width), spread(np.float32(4.0 * math.pi))))
     value = ratio(alpha2, below)
     value = where_above(light, none, where_above(cosine, none, where_above(alpha, none, value, none), none), none)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.environment import F32, F64, Floats, Table, search_cdf
-from icheat_usd.kernels.shadow import RUN, STATES
+from icheat_usd.kernels.shadow import STATES
+from icheat_usd.kernels.shadow_lanes import ORIGIN, RUN
 
 I32 = NDArray[np.int32]
 I16 = NDArray[np.int16]
@@ -105,7 +106,8 @@ def shape_places(
     to_local: F64,
     points: F32,
     distant: bool,
-    place: F32,
+    columns: F32,
+    column: I32,
     known: I16,
     row: I32,
     out: F32,
@@ -123,9 +125,9 @@ def shape_places(
         k, run, lane = known[i] // STATES, i // RUN, i % RUN
         wx, wy, wz = float(points[k, 0]), float(points[k, 1]), float(points[k, 2])
         if not distant:
-            wx -= place[run, 0, lane]
-            wy -= place[run, 1, lane]
-            wz -= place[run, 2, lane]
+            wx -= columns[column[run, ORIGIN], lane]
+            wy -= columns[column[run, ORIGIN + 1], lane]
+            wz -= columns[column[run, ORIGIN + 2], lane]
         length = math.sqrt(wx * wx + wy * wy + wz * wz)
         if length == 0.0:
             continue

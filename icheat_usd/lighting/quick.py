@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.see_through import cross_layers, dim_places
-from icheat_usd.kernels.shadow import GLOSS, PART, SHARED_PART, STRIDE, TURNED, light_places, tell_points
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.shadow import PART, SHARED_PART, STRIDE, TURNED, light_places, tell_points
+from icheat_usd.kernels.shadow_lanes import ALPHA, COLUMNS, RUN, SHADING, SPECULAR
 from icheat_usd.kernels.shaping import shape_places
 from icheat_usd.lighting.controls import darken, emission_frame, without
 from icheat_usd.lighting.points import light_points
@@ -23,7 +23,6 @@ from icheat_usd.tracing import build_tracer, spawn_points
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.tracing.paths import passing_materials
 
-_ALPHA = 6  # column of the tables of lobes
 _POINT_COLUMNS = [0, 1, 2, 3, 4, 5, 9]  # of the table of a light's points: place, normal, what it brings
 _CANDIDATES = 4  # points of the light that a place looks at
 _FEW_CANDIDATES = 2  # where places share rays
@@ -48,16 +47,26 @@ class Shadows:
         out = np.ones(len(origin), np.float32)
         if self.passing is not None:
             ends = np.ascontiguousarray(origin, np.float32), np.ascontiguousarray(direction, np.float32)
-            cross_layers(*self._layers(snapshot), *ends, limit, out)
+            given: tuple[Any, ...] = (*self._layers(snapshot), *ends, limit, out)
+            cross_layers(*given)
         return out
 
     def dim(
-        self, snapshot: SceneSnapshot, shining: Shining, places: Places, runs: I32, through: I32, crossing: F32, out: F32
+        self,
+        snapshot: SceneSnapshot,
+        shining: Shining,
+        places: Places,
+        runs: I32,
+        through: I32,
+        crossing: F32,
+        out: F32,
     ) -> None:
         """Dim what places of some runs get through see-through surfaces; see `kernels.see_through.dim_places`."""
         if self.passing is not None:
             light = shining.table, shining.distant
-            dim_places(*self._layers(snapshot), *light, places.place, places.row, runs, through, crossing, out)
+            of_places = *places.table, places.row, runs, through, crossing, out
+            given: tuple[Any, ...] = (*self._layers(snapshot), *light, *of_places)
+            dim_places(*given)
 
     def _layers(self, snapshot: SceneSnapshot) -> tuple[Any, ...]:
         """What kernels need to find the surfaces on a ray's way."""
@@ -99,15 +108,24 @@ class Places:
     row: I32  #: (n,) point of each place
     instance: I32  #: (n,) of each point
     bounds: F32  #: (n_runs, 4, 3)
-    place: F32  #: (n_runs, 9, RUN)
-    tint: F32  #: (n_runs, 3, RUN)
-    gloss: F32  #: (n_lobed, 12, RUN), none where no lobe is wanted
-    lobes: I32  #: (n_runs,)
+    columns: F32  #: (n_columns, RUN)
+    column: I32  #: (n_runs, COLUMNS), those of each run
+    lobes: Bool  #: (n_runs,)
 
     @property
     def n(self) -> int:
         """How many there are."""
         return len(self.row)
+
+    @property
+    def n_runs(self) -> int:
+        """In how many runs."""
+        return len(self.column)
+
+    @property
+    def table(self) -> tuple[F32, I32]:
+        """Columns, and which of them each run has."""
+        return self.columns, self.column
 
 
 class LastLook:
@@ -155,15 +173,42 @@ def prepare_places(
     place = np.concatenate([spawn_points(snapshot, points, points.normal), points.normal, points.shading_normal], 1)
     place[points.instance < 0] = 0.0
     row = np.arange(len(place), dtype=np.int32) if order is None else order.astype(np.int32)
-    n_runs = -(-len(place) // RUN)
-    gloss, lobes = np.zeros((0, GLOSS, RUN), np.float32), np.full(n_runs, -1, np.int32)
+    surface = _runs(np.concatenate([place, albedo / np.float32(np.pi)], axis=1), order)
+    gloss: F32 = np.zeros((0, COLUMNS - SPECULAR, RUN), np.float32)
+    lobes: Bool = np.zeros(len(surface), np.bool_)
     if to_eye is not None and is_glossy(points).any():
-        every = _runs(_lobes(points, to_eye), order)
-        lobed = every[:, _ALPHA].any(axis=1)
-        gloss, lobes[lobed] = every[lobed], np.arange(lobed.sum(), dtype=np.int32)
-    tint = _runs(albedo / np.float32(np.pi), order)
-    runs = _runs(place, order)
-    return Places(row, points.instance, _bounds(runs), runs, tint, gloss, lobes)
+        gloss = _runs(_lobes(points, to_eye), order)
+        lobes = np.any(gloss[:, ALPHA - SPECULAR], axis=1)
+        gloss = gloss[lobes]
+    columns, (of_surface, of_lobe) = _share_columns((surface, gloss))
+    column = np.zeros((len(surface), COLUMNS), np.int32)
+    column[:, :SPECULAR], column[lobes, SPECULAR:] = of_surface, of_lobe
+    return Places(row, points.instance, _bounds(surface[:, :SHADING]), columns, column, lobes)
+
+
+def _share_columns(tables: Sequence[F32]) -> tuple[F32, list[I32]]:
+    """Columns (n, RUN) of tables (n_runs, k, RUN), and the numbers (n_runs, k) that each table's columns have.
+
+    A column of one value, as normals of a wall are, is there once for all runs: what streams through the caches in
+    every frame is half as much.
+    """
+    every = np.concatenate([table.reshape(-1, RUN) for table in tables])
+    is_even = (every == every[:, :1]).all(axis=1)
+    values, shared = np.unique(every[is_even, 0], return_inverse=True)
+    number = np.empty(len(every), np.int32)
+    number[is_even], number[~is_even] = shared, len(values) + np.arange(np.count_nonzero(~is_even))
+    columns = _in_lines((len(values) + int(np.count_nonzero(~is_even)), RUN))
+    columns[: len(values)], columns[len(values) :] = values[:, None], every[~is_even]
+    ends = np.cumsum([table.shape[0] * table.shape[1] for table in tables])
+    parts = np.split(number, ends[:-1])
+    return columns, [part.reshape(table.shape[:2]) for part, table in zip(parts, tables, strict=True)]
+
+
+def _in_lines(shape: tuple[int, int]) -> F32:
+    """Room for numbers that begins with a line of the cache."""
+    room = np.empty(shape[0] * shape[1] + 16, np.float32)
+    first = -room.ctypes.data % 64 // 4
+    return room[first : first + shape[0] * shape[1]].reshape(shape)
 
 
 def _bounds(runs: F32) -> F32:
@@ -270,12 +315,7 @@ class Look:
     ) -> None:
         self._snapshot, self._shadows, self._places, self._shining, self._out = snapshot, shadows, places, shining, out
         controls = snapshot.controls(0)
-        self._tint, self._gloss = places.tint, places.gloss
-        if controls.diffuse != 1.0:
-            self._tint = places.tint * np.float32(controls.diffuse)
-        if controls.specular != 1.0:
-            self._gloss = places.gloss.copy()
-            self._gloss[:, :_ALPHA] *= np.float32(controls.specular)
+        self._diffuse, self._specular = controls.diffuse, controls.specular
         self._seed, self._share_rays, self._turn = seed, share_rays, turn
         self._groups = shining.groups(_FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
         self._through = np.empty(0 if shadows.passing is None else places.n, np.int32)
@@ -289,7 +329,7 @@ class Look:
 
     def pieces(self) -> list[Callable[[], None]]:
         """All runs, some at a time."""
-        every = np.arange(len(self._places.place), dtype=np.int32)
+        every = np.arange(self._places.n_runs, dtype=np.int32)
         return [partial(self.light, every[first : first + _PIECE]) for first in range(0, len(every), _PIECE)]
 
     def light(self, runs: I32, every_ray: bool = False) -> None:
@@ -313,10 +353,10 @@ class Look:
             self._seed,
             self._turn,
             places.bounds,
-            places.place,
-            self._tint,
-            self._gloss,
+            *places.table,
             places.lobes,
+            np.float32(self._diffuse),
+            np.float32(self._specular),
             self._share_rays,
             -1 if every_ray else self._phase,
             self._known,
@@ -337,7 +377,7 @@ class Look:
         if shaping is not None:
             # The choice among points was made without it, which the mean over choices does not notice.
             frame = emission_frame(snapshot, 0)
-            shape_places(shaping, *frame, table, distant, places.place, self._known, places.row, out)
+            shape_places(shaping, *frame, table, distant, *places.table, self._known, places.row, out)
         darken(snapshot, 0, places.instance, out)
 
 
@@ -360,7 +400,7 @@ def look_and_tell(
     (n_points,) int32
         See `kernels.shadow.tell_points`; empty where hardly any point has turned.
     """
-    before, n_points, every = last.known.copy(), len(shining.table), np.arange(len(places.place), dtype=np.int32)
+    before, n_points, every = last.known.copy(), len(shining.table), np.arange(places.n_runs, dtype=np.int32)
     look = Look(snapshot, shadows, places, shining, seed, False, out, 0, last, None)
     if len(last.told):
         look.light(every[::_TELLING], every_ray=True)
@@ -412,5 +452,5 @@ def direct_at(
     """
     shining = shining or shining_points(snapshot, seed)
     look = Look(snapshot, shadows, places, shining, seed, share_rays, out, turn, last, told)
-    look.light(np.arange(len(places.place), dtype=np.int32) if runs is None else runs)
+    look.light(np.arange(places.n_runs, dtype=np.int32) if runs is None else runs)
     look.finish()

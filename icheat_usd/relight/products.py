@@ -416,9 +416,9 @@ class Products:
         if known is not None:
             known(looked_at, some)
         self.see(looked_at, some)
+        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
         if seen is not None:
             seen()
-        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
         leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
         take_back()
         tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out, np.zeros(1, np.bool_))

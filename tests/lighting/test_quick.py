@@ -246,6 +246,51 @@ def test_light_crosses_layers_as_it_does_for_all_shadow_rays() -> None:
     assert len(np.unique(np.round(found, 3))) > 1
 
 
+def test_places_are_dimmed_by_what_their_rays_cross_or_crossed_before() -> None:
+    snapshot = scene(LIGHTS["rect"], Material(0.5))
+    points = on_floor(snapshot, 1500)  # the last run is not full
+    shadows, places = (
+        build_shadows(snapshot, tracer_of(snapshot)),
+        prepare_places(snapshot, points, points.albedo, None),
+    )
+    shining = shining_points(snapshot, 3)
+    rng = np.random.default_rng(0)
+    through = rng.integers(-20, 20, places.n).astype(np.int32) * (rng.uniform(size=places.n) < 0.3)
+    through[4 * RUN : 6 * RUN] = 0
+    through[6 * RUN : 7 * RUN] = -abs(through[6 * RUN : 7 * RUN])  # no ray was sent
+    runs = np.array([0, 3, 5, 6, 20, 23], np.int32)
+    meant = np.isin(np.arange(places.n) // RUN, runs)
+    crossing = rng.uniform(0, 1, places.n).astype(np.float32)
+    expected_crossing, out = crossing.copy(), rng.uniform(0, 1, (places.n, 3)).astype(np.float32)
+    sent = np.flatnonzero(meant & (through > 0))
+    origin = places.columns[places.column[sent // RUN, :3], (sent % RUN)[:, None]]
+    expected_crossing[sent] = shadows.crossing(
+        snapshot, origin, shining.table[through[sent] - 1, :3] - origin, 1.0 - 1e-4
+    )
+    expected = np.where((meant & (through != 0))[:, None], out * expected_crossing[:, None], out)
+    assert len(np.unique(expected_crossing[sent])) > 3
+    shadows.dim(snapshot, shining, places, runs, through, crossing, out)
+    np.testing.assert_array_equal(crossing, expected_crossing)
+    np.testing.assert_array_equal(out, expected)
+
+
+def test_columns_of_one_value_are_there_once() -> None:
+    snapshot = scene(LIGHTS["rect"], Material(0.5, roughness=0.5, ior=1.5))
+    points = on_floor(snapshot, 1000)
+    eye = np.random.default_rng(1).normal(size=(1000, 3)).astype(np.float32)
+    places = prepare_places(snapshot, points, points.albedo, eye / np.linalg.norm(eye, axis=1, keepdims=True))
+    values = places.columns[places.column].transpose(0, 2, 1).reshape(-1, places.column.shape[1])[:1000]
+    np.testing.assert_array_equal(values[:, 3:6], points.normal)
+    np.testing.assert_array_equal(values[:, 6:9], points.shading_normal)
+    np.testing.assert_array_equal(values[:, 9:12], points.albedo / np.float32(np.pi))
+    np.testing.assert_array_equal(values[:, 12:15], points.specular)
+    np.testing.assert_array_equal(values[:, 18], np.float32(points.roughness.astype(np.float64) ** 2))
+    np.testing.assert_allclose(values[:, 21:24], eye / np.linalg.norm(eye, axis=1, keepdims=True), rtol=1e-6)
+    # Of full runs the normals, albedo and lobe of a floor are the same.
+    shared = places.column[:-1, 3:19]
+    assert (shared == shared[:1]).all() and places.columns.ctypes.data % 64 == 0
+
+
 def test_a_turned_dome_shines_as_the_general_sampler_says() -> None:
     rows, columns = np.mgrid[0:16, 0:32]
     image = Image(np.stack([1 + rows, 2 + columns, 4 + 0 * rows], -1).astype(np.float32) / 8)

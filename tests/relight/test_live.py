@@ -13,7 +13,7 @@ import pytest
 from icheat_usd.edits.model import Blend, Edit, EditStack, KeyedPayload, Payload, SurfaceMask
 from icheat_usd.errors import EditError
 from icheat_usd.relight.live import LiveRelighter
-from icheat_usd.relight.products import _Tiles
+from icheat_usd.relight.products import Products, _Tiles
 from icheat_usd.scene import F32
 from icheat_usd.transport import sum_lights
 from icheat_usd.transport.packed import PackedLobe, PackedTransport
@@ -531,6 +531,32 @@ def test_edits_of_few_cells_are_read_in_part_and_change_what_they_should(monkeyp
     found, multiply = change(strong, 1.0, 0.1), _Tiles.multiply
     monkeypatch.setattr(_Tiles, "multiply", lambda tiles, *given: multiply(tiles, *given[:7]))
     np.testing.assert_array_equal(change(strong, 1.0, 0.1), found)
+
+
+def test_of_an_edit_beside_its_light_at_rest_as_much_is_left_out_as_of_all_of_it(monkeypatch):
+    """What differs from light at rest is small, and need not be better than the edit that it is a part of."""
+    of, rows = pipeline("full"), poor(packed("full"))
+    stack = EditStack("/stack", (edit("a", "scale", select("/floor"), select("/back", "/floor")),))
+    monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
+    monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT", 0.0)
+    monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT_OF_VERSION", 1.0)
+
+    def change(of_itself: float) -> F32:
+        monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT_OF_ITSELF", of_itself)
+        lights = RestingLights(of)
+        shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights)
+        shown.set_stack(stack)
+        refined(shown)
+        lights.radiance = lights.radiance.copy()
+        lights.radiance[0] = 0.95 * lights.radiance[0] + 0.05 * lights.radiance[0, ::-1]
+        lights.moves += 1
+        lights.revision += 1
+        seen = shown.relit()
+        return seen.indirect_edited - seen.indirect
+
+    whole, some, find = change(0.0), change(0.1), Products._find_least
+    monkeypatch.setattr(Products, "_find_least", lambda of, at, part, least: find(of, at, np.ones_like(part), least))
+    assert rms_of(change(0.1), whole) < 0.2 * rms_of(some, whole) < 0.2 * 0.1
 
 
 def test_a_light_that_goes_down_at_once_has_the_terms_that_are_large_in_what_is_left(monkeypatch):
