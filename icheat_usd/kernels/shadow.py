@@ -359,9 +359,9 @@ def _fetch_columns(columns: int, column: np.ndarray, run: int, other: int, first
 def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
     colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray,
-    columns: np.ndarray, column: np.ndarray, lobes: np.ndarray, diffuse: np.float32, specular: np.float32, share_rays: bool,
-    phase: int, known: np.ndarray, told: np.ndarray, row: np.ndarray, wanted: np.ndarray, out: np.ndarray,
-    through: np.ndarray, first: int, last: int,
+    columns: np.ndarray, column: np.ndarray, lobes: np.ndarray, diffuse: np.float32, specular: np.float32,
+    share_rays: bool, phase: int, known: np.ndarray, told: np.ndarray, row: np.ndarray, wanted: np.ndarray,
+    out: np.ndarray, through: np.ndarray, first: int, last: int,
 ) -> None:  # fmt: skip
     """`light_places` for those runs that are `wanted` from number `first` up to `last`."""
     n, candidates, width = last - first, points.shape[0], points.shape[2]
