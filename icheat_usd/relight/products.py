@@ -332,7 +332,7 @@ class Products:
         assert self._few_terms is not None and self._energy is not None
         error = LEFT_OUT_OF_VERSION**2 * self._shown
         # Of a small part, a larger share is as much of the whole version.
-        share = np.minimum(LEFT_OUT_OF_ITSELF**2 / np.maximum(part, LEFT_OUT_OF_ITSELF**2), 1.0)
+        share = np.minimum(LEFT_OUT_OF_ITSELF**2 / np.maximum(part, np.finfo(np.float64).tiny), 1.0)
         is_large = self._is_large[versions]
         for v in versions[is_large]:
             of_itself = self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES, float(share[v]))
