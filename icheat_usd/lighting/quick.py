@@ -366,8 +366,7 @@ class Look:
             self._out,
             self._through,
         )
-        if len(self._through):
-            shadows.dim(self._snapshot, self._shining, places, runs, self._through, self._crossing, self._out)
+        shadows.dim(self._snapshot, self._shining, places, runs, self._through, self._crossing, self._out)
 
     def finish(self) -> None:
         """Dim all that is lit: the light's shaping, and surfaces that it does not light. Every run is lit before."""
