@@ -215,5 +215,7 @@ def multiply_found(  # type: ignore[no-untyped-def]
             if job + 1 < last:
                 next_count = _prepare(found[found_begin[job + 1] : found_begin[job + 2]], value)
             number = numbers + 4 * found_begin[job]
-            multiply_tile(tables, job_version[job], job_out[job], number, count, number, 0, address_of(room))
+            n_fetched = min(count, _AHEAD)
+            work = tables, job_version[job], job_out[job], number, count, n_fetched, number, 0
+            multiply_tile(*work, address_of(room))
         room[0] = np.float32(0)  # keeps it

@@ -71,7 +71,7 @@ def _multiply_run(  # type: ignore[no-untyped-def]
     for job in range(first, last):
         most = max(most, tile_begin[job_tile[job] + 1] - tile_begin[job_tile[job]])
     rooms, room = np.empty((2, most + 18), np.int32), new_room()
-    tables, n_following = tables_of(index, scale, value, coefficients, out), 0
+    tables, n_following, n_fetched = tables_of(index, scale, value, coefficients, out), 0, 0
     for job in range(first, last + 1):
         n, n_following = n_following, 0
         if job < last:
@@ -79,8 +79,8 @@ def _multiply_run(  # type: ignore[no-untyped-def]
             n_following = _find_pairs(begin, end, index, worth, size, least, job_version[job], rooms[job % 2])
         if job > first:
             made, number, following = job - 1, address_of(rooms[(job - 1) % 2]), address_of(rooms[job % 2])
-            work = tables, job_version[made], job_out[made], number, n, following, n_following, address_of(room)
-            multiply_tile(*work)
+            work = tables, job_version[made], job_out[made], number, n, n_fetched, following, n_following
+            n_fetched = multiply_tile(*work, address_of(room))
     room[0] = np.float32(0)  # keeps it
 
 
@@ -108,9 +108,8 @@ def multiply_terms(  # type: ignore[no-untyped-def]
     Notes
     -----
     Rounding moves a product by at most half a step for each coefficient, the
-    step being the largest |scale * coefficient| of some hundred and the channel / 32767
-    (or slightly more, where 32 bits could overflow): small against the half
-    quantum that the transport was rounded by. Sums run in the order of a
+    step being the largest |scale * coefficient| of some hundred and the channel / 32767:
+    small against the half quantum that the transport was rounded by. Sums run in the order of a
     tile's coefficients, so a product has the same bits whatever other jobs or threads there are.
     """
     cost_end = sum_costs(tile_begin, job_tile)

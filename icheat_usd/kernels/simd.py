@@ -152,7 +152,8 @@ def plus(builder: Any, values: Any) -> Any:
 @_operation(floats, floats, floats)
 def larger(builder: Any, values: Any) -> Any:
     """The larger of `a` and ``|b|``, place by place; `a` where `b` is not a number."""
-    return _larger_size(builder, values[0], values[1], _I16X)
+    size = _size(builder, values[1], _I16X)
+    return builder.select(builder.fcmp_ordered(">", size, values[0]), size, values[0])
 
 
 @_operation(floats, floats)
@@ -164,13 +165,14 @@ def positive(builder: Any, values: Any) -> Any:
 @_operation(types.float32, floats)
 def total(builder: Any, values: Any) -> Any:
     """Sum of all 16, in halves."""
-    return _halved(builder, values[0], builder.fadd)
+    total = _halved(builder, values[0], lambda builder, a, b: builder.fadd(a, b))
+    return builder.extract_element(total, ir.Constant(_I32, 0))
 
 
 @_operation(types.float32, floats)
 def peak(builder: Any, values: Any) -> Any:
     """The largest of all 16, of which none is below 0."""
-    return _halved(builder, values[0], lambda a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
+    return builder.extract_element(_halved(builder, values[0], _larger), ir.Constant(_I32, 0))
 
 
 def _positive(builder: Any, value: Any) -> Any:
@@ -178,16 +180,17 @@ def _positive(builder: Any, value: Any) -> Any:
     return builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
 
 
-def _halved(builder: Any, value: Any, combine: Any) -> Any:
-    """Combine the halves of a vector until one number is left."""
-    size = 16
-    while size > 1:
-        size //= 2
-        value = combine(
-            _picked(builder, value, value, list(range(size))),
-            _picked(builder, value, value, list(range(size, 2 * size))),
-        )
-    return builder.extract_element(value, ir.Constant(_I32, 0))
+def _larger(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", b, a), b, a)
+
+
+def _halved(builder: Any, value: Any, combine: Any, size: int = 1) -> Any:
+    """Combine the halves of a vector until `size` numbers are left."""
+    while value.type.count > size:
+        half = value.type.count // 2
+        low, high = list(range(half)), list(range(half, 2 * half))
+        value = combine(builder, _picked(builder, value, value, low), _picked(builder, value, value, high))
+    return value
 
 
 @_operation(floats, floats)
@@ -424,21 +427,16 @@ def plus_size(builder: Any, values: Any) -> Any:
     return builder.fadd(values[0], _size(builder, values[1], ir.VectorType(_I32, 4)))
 
 
-@_operation(color, color, color)
-def larger_size(builder: Any, values: Any) -> Any:
-    """The larger of `a` and ``|b|``, `a` where `b` is not a number."""
-    return _larger_size(builder, values[0], values[1], ir.VectorType(_I32, 4))
-
-
-def _larger_size(builder: Any, a: Any, b: Any, bits: Any) -> Any:
-    size = _size(builder, b, bits)
-    return builder.select(builder.fcmp_ordered(">", size, a), size, a)
-
-
 def _size(builder: Any, value: Any, bits: Any) -> Any:
     """Size of each float of a vector; `bits` is the type of whole numbers as wide as it."""
     size = builder.and_(builder.bitcast(value, bits), ir.Constant(bits, [0x7FFFFFFF] * bits.count))
     return builder.bitcast(size, value.type)
+
+
+@_operation(color, floats)
+def largest_of_fours(builder: Any, values: Any) -> Any:
+    """The largest of each channel of four colours, of which none is below 0."""
+    return _halved(builder, values[0], _larger, 4)
 
 
 @_operation(types.void, types.int64, color)

@@ -21,14 +21,14 @@ from icheat_usd.kernels.simd import (
     color_of,
     fetch,
     four_times,
-    larger_size,
+    larger,
+    largest_of_fours,
     load,
     load_color,
     load_number,
     load_one,
     no_sum,
     plus,
-    plus_size,
     product,
     ratios,
     rounded_pairs,
@@ -44,11 +44,12 @@ from icheat_usd.kernels.simd import (
 
 QUANTA = 2 * LANES  #: bytes of a pair of coefficients
 _PRODUCT = 16 * LANES  # bytes of a product
-_AT_ONCE = 128  # pairs of coefficients: their quanta are in the second-level cache before they are multiplied
+# Pairs of coefficients: their quanta are in the second-level cache before they are multiplied. Sums of twice as many
+# products of a word and a quantum, 32767 * 128 each, stay within 32 bits.
+_AT_ONCE = 128
 _COLORS = 16 * (_AT_ONCE + 4)  # bytes of a colour for each, and what is beyond the last as vectors are whole
 _SUMS = 12 * 64  # bytes
 _WORD_STEPS = 1.0 / 32767.0
-_LARGEST_SUM = 2.0**31 / 128 * (1 - 1e-3)  # of the sizes of a tile's words: no sum with quanta overflows 32 bits
 
 
 class Tables(NamedTuple):
@@ -84,33 +85,42 @@ def new_room() -> np.ndarray:
 
 
 @kernel
-def _scale_pairs(number: int, n: int, tables: Tables, coefficients: int, even: int, odd: int) -> tuple[Any, Any]:
-    """Colours that the quanta of `n` pairs multiply, every second one apart; their largest sizes, and sums of sizes.
+def _scale_pairs(number: int, n: int, n_fetched: int, tables: Tables, coefficients: int, even: int, odd: int) -> None:
+    """Colours that the quanta of `n` pairs multiply, every second one apart; whole vectors, so up to three pairs more.
 
-    Meanwhile the quanta come into the cache.
+    Meanwhile the quanta come into the cache, but for those of the first pairs, which were asked for before.
     """
-    largest_even = largest_odd = sum_even = sum_odd = black()
-    for _ in range(n):
+    for i in range(n):
         pair = load_number(number)
-        ahead = tables.value + QUANTA * pair
-        fetch(ahead)
-        fetch(ahead + 64)
+        if i >= n_fetched:
+            ahead = tables.value + QUANTA * pair
+            fetch(ahead)
+            fetch(ahead + 64)
         where, size = tables.index + 8 * pair, tables.scale + 8 * pair
-        a = scaled(load_color(coefficients + 16 * load_number(where)), load_one(size))
-        b = scaled(load_color(coefficients + 16 * load_number(where + 4)), load_one(size + 4))
-        store_color(even, a)
-        store_color(odd, b)
-        largest_even, sum_even = larger_size(largest_even, a), plus_size(sum_even, a)
-        largest_odd, sum_odd = larger_size(largest_odd, b), plus_size(sum_odd, b)
+        store_color(even, scaled(load_color(coefficients + 16 * load_number(where)), load_one(size)))
+        store_color(odd, scaled(load_color(coefficients + 16 * load_number(where + 4)), load_one(size + 4)))
         number += 4
         even += 16
         odd += 16
-    return larger_size(largest_even, largest_odd), plus_size(sum_even, sum_odd)
+    for _ in range(-n % 4):
+        store_color(even, black())
+        store_color(odd, black())
+        even += 16
+        odd += 16
+
+
+@kernel
+def _largest(n: int, even: int, odd: int) -> Any:
+    """Largest size of each channel of `n` pairs of colours."""
+    a = b = zeros()
+    for offset in range(0, 16 * n, 64):
+        a, b = larger(a, load(even + offset)), larger(b, load(odd + offset))
+    return largest_of_fours(larger(a, b))
 
 
 @kernel
 def _round_pairs(n: int, even: int, odd: int, per_step: Any, words: int) -> None:
-    """`n` pairs of colours in steps, as int16; whole vectors, so up to three pairs more."""
+    """`n` pairs of colours in steps, as int16; whole vectors, too."""
     factor = four_times(per_step)
     for offset in range(0, 16 * n, 64):
         a, b = load(even + offset), load(odd + offset)
@@ -163,17 +173,24 @@ def _multiply_pairs(
 
 @kernel
 def multiply_tile(
-    tables: Tables, version: int, to: int, number: int, n: int, following: int, n_following: int, room: int
-) -> None:
+    tables: Tables, version: int, to: int, number: int, n: int, n_fetched: int, following: int, n_following: int,
+    room: int,
+) -> int:  # fmt: skip
     """Some pairs of coefficients of one tile times one version.
 
     Parameters
     ----------
     version, to : number of the light, and of the product
     number, n : address of int32 numbers of the pairs, and how many they are
+    n_fetched : how many of the first of these were asked for before
     following, n_following
         The same of the next product, whose quanta come into the cache meanwhile; there may be none.
     room : address of a `new_room`
+
+    Returns
+    -------
+    int
+        How many of the first pairs that follow were asked for.
     """
     coefficients, out = tables.light + tables.light_step * np.int64(version), tables.out + _PRODUCT * np.int64(to)
     even, odd, words, sums = room, room + _COLORS, room + 2 * _COLORS, room + 3 * _COLORS
@@ -183,9 +200,8 @@ def multiply_tile(
     while n > 0:
         some, rest = min(n, _AT_ONCE), n - min(n, _AT_ONCE)
         end = number + 4 * some
-        largest, total = _scale_pairs(number, some, tables, coefficients, even, odd)
-        most = np.float32(1.0 / (_LARGEST_SUM - 2.0 * some))
-        step = larger_size(scaled(largest, np.float32(_WORD_STEPS)), scaled(total, most))
+        _scale_pairs(number, some, n_fetched, tables, coefficients, even, odd)
+        step = scaled(_largest(some, even, odd), np.float32(_WORD_STEPS))
         _round_pairs(some, even, odd, ratios(one, step), words)
         if rest > 0:
             ahead, n_ahead = end, min(rest, _AT_ONCE)
@@ -194,6 +210,7 @@ def multiply_tile(
         else:
             ahead, n_ahead = number, some
         _multiply_pairs(number, some, tables.value, words, step, ahead, n_ahead, sums)
-        number, n = end, rest
+        number, n, n_fetched = end, rest, min(some, n_ahead)
     for k in range(4):
         store_colors(out + 256 * k, load(sums + 64 * k), load(sums + 256 + 64 * k), load(sums + 512 + 64 * k))
+    return n_fetched if n_following > 0 else 0
