@@ -402,8 +402,9 @@ def look_and_tell(
     before, n_points, every = last.known.copy(), len(shining.table), np.arange(places.n_runs, dtype=np.int32)
     look = Look(snapshot, shadows, places, shining, seed, False, out, 0, last, None)
     if len(last.told):
-        look.light(every[::_TELLING], every_ray=True)
-        sent = (every[::_TELLING, None].astype(np.int64) * RUN + np.arange(RUN)).ravel()
+        telling = every[::_TELLING].copy()  # for an array with gaps all would be compiled once more
+        look.light(telling, every_ray=True)
+        sent = (telling[:, None].astype(np.int64) * RUN + np.arange(RUN)).ravel()
         look.told = last.told = last.tell_points(before, sent[sent < places.n], n_points)
         look.light(every[every % _TELLING != 0])
     else:

@@ -87,7 +87,8 @@ class Narrow:
         def add(products: F32, tile: I32) -> None:
             known = self._known
             if len(tile) < n_tiles:
-                known = known[:, (np.arange(len(products))[:, None] * n_tiles + tile).ravel()]
+                # An index would give the array another order in memory, and kernels were compiled for this one.
+                known = np.take(known, (np.arange(len(products))[:, None] * n_tiles + tile).ravel(), axis=1)
             add_light_residuals(known, factors, len(tile), products.reshape(*products.shape[:2], 4 * LANES))
 
         if is_same.all() and len(is_same):

@@ -428,7 +428,7 @@ class Products:
     def see(self, products: F32, tile: I32) -> None:
         """Take products of some tiles for those of the unedited light, beside which others are large or small."""
         if self._haar and self._large_terms is not None:
-            counts = self._counts[:, tile]
+            counts = np.take(self._counts, tile, axis=1)  # as an index would order it, it would depend on the lobes
             found = np.empty(counts.shape[0] * counts.shape[1])
             squares_of_tiles(products.reshape(*products.shape[:2], 4 * LANES), counts, found)
             self._shown = float(found.sum()) * self.n_tiles / max(len(tile), 1)

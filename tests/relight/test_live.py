@@ -10,6 +10,7 @@ import numba
 import numpy as np
 import pytest
 
+from icheat_usd import relight
 from icheat_usd.edits.model import Blend, Edit, EditStack, KeyedPayload, Payload, SurfaceMask
 from icheat_usd.errors import EditError
 from icheat_usd.relight.live import LiveRelighter
@@ -19,7 +20,7 @@ from icheat_usd.transport import sum_lights
 from icheat_usd.transport.packed import PackedLobe, PackedTransport
 from icheat_usd.transport.packing import lossless
 from tests.pipeline import Pipeline, select
-from tests.relight.test_operations import MIXED, PARAMETERS, baked, edit, pipeline, soft, soft_mask, stacks
+from tests.relight.test_operations import MIXED, PARAMETERS, baked, edit, pipeline, room, soft, soft_mask, stacks
 
 
 class StillLights:
@@ -290,8 +291,11 @@ def test_baked_rows_equal_the_exact_relighter():
 
 @functools.cache
 def packed(kind: str) -> PackedTransport:
+    return packed_rows(pipeline(kind))
+
+
+def packed_rows(of: Pipeline) -> PackedTransport:
     """All coefficients of all rows, in floats."""
-    of = pipeline(kind)
     exact = of.transport
     lobes = tuple(PackedLobe(lobe.name, lossless(lobe.rows, of.gather.tree), lobe.tint) for lobe in exact.lobes)
     return PackedTransport(lobes, exact.row_view, exact.interpolation, exact)
@@ -533,6 +537,19 @@ def test_edits_of_few_cells_are_read_in_part_and_change_what_they_should(monkeyp
     np.testing.assert_array_equal(change(strong, 1.0, 0.1), found)
 
 
+def after_rest(of: Pipeline, rows: PackedTransport, stack: EditStack) -> LiveRelighter:
+    """One that was at rest, with one of its two lights a little different since."""
+    lights = RestingLights(of)
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights)
+    shown.set_stack(stack)
+    refined(shown)
+    lights.radiance = lights.radiance.copy()
+    lights.radiance[0] = 0.95 * lights.radiance[0] + 0.05 * lights.radiance[0, ::-1]
+    lights.moves += 1
+    lights.revision += 1
+    return shown
+
+
 def test_of_an_edit_beside_its_light_at_rest_as_much_is_left_out_as_of_all_of_it(monkeypatch):
     """What differs from light at rest is small, and need not be better than the edit that it is a part of."""
     of, rows = pipeline("full"), poor(packed("full"))
@@ -543,20 +560,34 @@ def test_of_an_edit_beside_its_light_at_rest_as_much_is_left_out_as_of_all_of_it
 
     def change(of_itself: float) -> F32:
         monkeypatch.setattr("icheat_usd.relight.products.LEFT_OUT_OF_ITSELF", of_itself)
-        lights = RestingLights(of)
-        shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights)
-        shown.set_stack(stack)
-        refined(shown)
-        lights.radiance = lights.radiance.copy()
-        lights.radiance[0] = 0.95 * lights.radiance[0] + 0.05 * lights.radiance[0, ::-1]
-        lights.moves += 1
-        lights.revision += 1
-        seen = shown.relit()
+        seen = after_rest(of, rows, stack).relit()
         return seen.indirect_edited - seen.indirect
 
     whole, some, find = change(0.0), change(0.1), Products._find_least
     monkeypatch.setattr(Products, "_find_least", lambda of, at, part, least: find(of, at, np.ones_like(part), least))
     assert rms_of(change(0.1), whole) < 0.2 * rms_of(some, whole) < 0.2 * 0.1
+
+
+@pytest.mark.parametrize("kernel", ["narrow.add_light_residuals", "products.squares_of_tiles"])
+def test_kernels_get_arrays_without_gaps(kernel, monkeypatch):
+    """Others would be compiled for once more, in the middle of a frame."""
+    of = Pipeline(room(16), n_gather=48, rays=32, bounce_rays=32, light_samples=4, n_bounces=4)
+    rows = poor(packed_rows(of))
+    monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
+    monkeypatch.setattr("icheat_usd.relight.products._TILES_LOOKED_AT", 2)
+    assert len(rows.lobes) > 1 and rows.lobes[0].rows.n_tiles > 2 and len(RestingLights(of).radiance) > 1
+    shown = after_rest(of, rows, EditStack("/none", ()))
+    module, name = kernel.split(".")
+    called = getattr(getattr(relight, module), name)
+    given: list[bool] = []
+
+    def look(*arrays: Any) -> Any:
+        given.extend(array.flags.c_contiguous for array in arrays if isinstance(array, np.ndarray))
+        return called(*arrays)
+
+    monkeypatch.setattr(f"icheat_usd.relight.{kernel}", look)
+    shown.relit()
+    assert given and all(given)
 
 
 def test_a_light_that_goes_down_at_once_has_the_terms_that_are_large_in_what_is_left(monkeypatch):
