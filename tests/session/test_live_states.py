@@ -245,9 +245,10 @@ def test_surfaces_are_shown_before_there_is_light(stage: Path) -> None:
     with open_live(stage) as live:
         live.listen(heard.append)
         live.frame()
-    kinds = [event.kind for event in heard if event.kind != "progress"]
-    assert kinds[0] == "surfaces" and kinds.count("surfaces") == 1
-    assert sum(event.kind == "better" and event.level == "preview" for event in heard) == 1
+    told = [(event.kind, event.level) for event in heard if event.kind != "progress"]
+    # Finer rows may have come before the session was closed: what follows the first image is not for this test.
+    assert [kind for kind, _ in told].count("surfaces") == 1 and told[0][0] == "surfaces"
+    assert told[1] == ("better", "preview")
     image = next(event.image for event in heard if event.kind == "surfaces")
     assert image is not None and image.shape == (15, 20, 3) and image.dtype == np.float32
     assert 0 < image.min() and image.max() < 1
