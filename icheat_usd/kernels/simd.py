@@ -152,8 +152,7 @@ def plus(builder: Any, values: Any) -> Any:
 @_operation(floats, floats, floats)
 def larger(builder: Any, values: Any) -> Any:
     """The larger of `a` and ``|b|``, place by place; `a` where `b` is not a number."""
-    size = _size(builder, values[1], _I16X)
-    return builder.select(builder.fcmp_ordered(">", size, values[0]), size, values[0])
+    return _larger(builder, values[0], _size(builder, values[1], _I16X))
 
 
 @_operation(floats, floats)
@@ -181,6 +180,7 @@ def _positive(builder: Any, value: Any) -> Any:
 
 
 def _larger(builder: Any, a: Any, b: Any) -> Any:
+    """The larger of two, `a` where `b` is not a number."""
     return builder.select(builder.fcmp_ordered(">", b, a), b, a)
 
 
