@@ -6,7 +6,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,13 @@ from icheat_usd.final_gather import GatherSettings
 from icheat_usd.kernels._signatures import UnlistedTypeError, dispatchers, encode, kernels_called
 from icheat_usd.relight import products
 from icheat_usd.resources import resource_path
+from icheat_usd.session import first_use
 from icheat_usd.session.document import Session
 from icheat_usd.session.live import LiveSession
+from icheat_usd.session.live_events import LiveEvent
 from icheat_usd.session.quality import DRAFT, LIVE, PREVIEW, QUICK, RECORDS, Quality
 from icheat_usd.session.warming import RARE, Listed
+from tools.kernel_stage import write_stage
 
 _ROOT = Path(__file__).parents[1]
 _WIDTH, _HEIGHT = 64, 48
@@ -28,8 +33,31 @@ _LIVE = replace(LIVE, **_LITTLE, record_rays=128)
 _RELIGHT = (replace(RECORDS, **_LITTLE, record_rays=128), replace(DRAFT, **_LITTLE), replace(PREVIEW, **_LITTLE))
 #: Not those that call kernels by themselves, with types that nothing else has.
 _WHOLE_PICTURES = ("tests/final_gather", "tests/relight", "tests/session", "tests/cli", "tests/test_known_answers.py")
-#: A lamp and opaque walls; a sky, glass, metal and painted edits.
+#: A lamp and diffuse walls; metal and painted edits.
 _STAGES = ("cornell_box", "glossy_set")
+
+
+def _look() -> None:
+    _live_until("surfaces")
+
+
+def _preview() -> None:
+    _live_until("better")
+
+
+def _live_until(kind: str) -> None:
+    """Open live sessions, and close each from within its background when listeners hear that."""
+    for stage in _live_stages():
+        heard = threading.Event()
+        with LiveSession.open(stage, width=_WIDTH, height=_HEIGHT, quality=_LIVE) as live:
+
+            def listen(event: LiveEvent, live: LiveSession = live, heard: threading.Event = heard) -> None:
+                if event.kind in (kind, "error"):
+                    live.close()
+                    heard.set()
+
+            live.listen(listen)
+            heard.wait()
 
 
 def _live() -> None:
@@ -40,8 +68,8 @@ def _live() -> None:
 
 
 def _change_a_little() -> None:
-    for name in _STAGES:
-        with LiveSession.open(_stage(name), width=_WIDTH, height=_HEIGHT, quality=_LIVE) as live:
+    for stage in _live_stages():
+        with LiveSession.open(stage, width=_WIDTH, height=_HEIGHT, quality=_LIVE) as live:
             live.frame()
             light = next(iter(live.lights))
             live.set_light(light, gain=0.5, move=(0.01, 0.0, 0.0))
@@ -55,6 +83,12 @@ def _change_a_little() -> None:
             live.film()
             live.set_light(light, gain=0.4)
             live.frame()
+
+
+def _live_stages() -> Iterator[Path]:
+    yield from map(_stage, _STAGES)
+    with tempfile.TemporaryDirectory() as folder:
+        yield write_stage(Path(folder))
 
 
 def _relight() -> None:
@@ -79,11 +113,19 @@ def _stage(name: str) -> Path:
 
 
 #: What is done for each purpose of `icheat_usd.session.warming`.
-TASKS: dict[str, Callable[[], None]] = {"live": _live, "relight": _relight, "render": _render}
+TASKS: dict[str, Callable[[], None]] = {
+    "look": _look,
+    "preview": _preview,
+    "live": _live,
+    "relight": _relight,
+    "render": _render,
+}
 
 
 def record(purpose: str) -> None:
     """Do what a purpose does, and print the kernels that this process has compiled or loaded, as JSON."""
+    # Each is compiled in this process when it is called: only so does it tell what it calls.
+    first_use.may_help = lambda: False
     TASKS[purpose]()
     print(json.dumps(_entries(purpose, lambda dispatcher: dispatcher.overloads)))
 

@@ -10,9 +10,9 @@ from icheat_usd.progress import Progress
 
 def compile_first(purpose: str, progress: Progress) -> None:
     """Compile what one of `session.warming.PURPOSES` needs; a failure is told, and left to whoever calls the kernel."""
-    from icheat_usd.session.warming import available_cores, compile_ahead
+    from icheat_usd.session.warming import compile_ahead, may_help
 
-    if available_cores() < 2:  # Kernels are then compiled as they are called, and no others.
+    if not may_help():  # Kernels are then compiled as they are called, and no others.
         return
     try:
         compile_ahead((purpose,), progress=progress)

@@ -148,16 +148,7 @@ class Session(ShotParts):
     @cached_property
     def snapshot(self) -> SceneSnapshot:
         """The stage at the session's frame."""
-        width, height = self._size
-        snapshot = take_snapshot(
-            self.stage,
-            camera=self.camera,
-            time=self.frame,
-            width=width,
-            height=height,
-            product=self._product,
-            progress=self.progress,
-        )
+        snapshot = self._take_snapshot()
         if len(snapshot.geometry.face) == 0:
             reasons = "; ".join(f"{f.prim}: {f.message}" for f in snapshot.findings[:3])
             raise StageError(
@@ -165,6 +156,23 @@ class Session(ShotParts):
                 f" check visibility, purpose and the frame{' (' + reasons + ')' if reasons else ''}"
             )
         return snapshot
+
+    def rough_snapshot(self) -> SceneSnapshot:
+        """The stage at the session's frame, subdivision surfaces as their control meshes; not kept."""
+        return self._take_snapshot(subdivision_level=None)
+
+    def _take_snapshot(self, **choices: Any) -> SceneSnapshot:
+        width, height = self._size
+        return take_snapshot(
+            self.stage,
+            camera=self.camera,
+            time=self.frame,
+            width=width,
+            height=height,
+            product=self._product,
+            progress=self.progress,
+            **choices,
+        )
 
     # Edits
 

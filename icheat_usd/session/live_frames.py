@@ -22,7 +22,8 @@ from icheat_usd.session.content_keys import digest
 from icheat_usd.session.dabs import TexelPlaces
 from icheat_usd.session.document import Session
 from icheat_usd.session.evaluator import Evaluator
-from icheat_usd.session.first_look import surfaces_by_headlight
+from icheat_usd.session.first_look import rough_surfaces, surfaces_by_headlight
+from icheat_usd.session.first_use import FirstUse
 from icheat_usd.session.frames import ResidentFrames, SharedParts, share_tables
 from icheat_usd.session.live_events import Level, Listener, LiveEvent
 from icheat_usd.session.live_state import UNCHANGED, LiveState
@@ -76,6 +77,7 @@ class LiveFrames:
         self._building_version = 0  #: of the lights in `_building`
         self._asked: tuple[float | None, Level] = (None, Level.NONE)  #: what the background is to make
         self._job: tuple[float | None, Level] = self._asked  #: what it makes for that, which may be better
+        self._first_use = FirstUse()
         start_workers()
         self._background = Background(self._next_job, self._on_error, kernels_may_overlap, give_freed_memory_back)
         self._background.start()
@@ -197,6 +199,7 @@ class LiveFrames:
 
     def close(self) -> None:
         self._background.close()
+        self._first_use.close()
 
     def _changed(self) -> None:
         """What is shown is to be refined again."""
@@ -257,6 +260,9 @@ class LiveFrames:
             self._make_of_parts(number, level)
 
     def _make_of_parts(self, number: float | None, level: Level) -> None:
+        if not self._first_use.is_done("look"):
+            self._look_roughly(number)
+            self._first_use.wait("look", self._progress)
         began, version = time.perf_counter(), self._lights_version
         if self._building_version != version:
             self._building.clear()
@@ -275,6 +281,7 @@ class LiveFrames:
             if frame.evaluator is None:
                 look = surfaces_by_headlight(parts.view)
                 self._tell(LiveEvent("surfaces", number, frame.level, image=look))
+            self._first_use.wait("preview" if level is Level.PREVIEW else "live", self._progress)
             for transport in parts.transports():
                 if evaluator is None:
                     evaluator = self._evaluator(parts, frame, transport, level)
@@ -294,6 +301,16 @@ class LiveFrames:
         if frame.evaluator is not evaluator or frame.level is not level:
             self._show(number, frame, evaluator, level, began)
         self._forget_parts(number, *((level,) if level is Level.PREVIEW else Level))
+
+    def _look_roughly(self, number: float | None) -> None:
+        """Show the surfaces while what would show them better is compiled."""
+        if self.resident.get(number) is not None:
+            return
+        shot = self.session.at(number)
+        shot.progress = silent
+        with self.stage_lock:
+            snapshot = shot.rough_snapshot()
+        self._tell(LiveEvent("surfaces", number, Level.NONE, image=rough_surfaces(snapshot)))
 
     def _evaluator(
         self, parts: ShotParts, frame: LiveFrame, transport: Transport | PackedTransport, level: Level

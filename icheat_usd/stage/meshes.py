@@ -80,7 +80,7 @@ def read_mesh(
     mesh: UsdGeom.Mesh,
     time: Usd.TimeCode,
     materials: FaceMaterials,
-    level: int,
+    level: int | None,
     report: Reporter,
     known: dict[bytes, TriangleMesh | None] | None = None,
     deformation: Deformation | None = None,
@@ -96,7 +96,7 @@ def read_mesh(
     materials
         Material rows of the faces; they decide which texture coordinates are read.
     level
-        Subdivision steps for ``catmullClark`` and ``bilinear`` meshes.
+        Subdivision steps for ``catmullClark`` and ``bilinear`` meshes; None takes them as polygons.
     report
         Receives what is wrong or not supported.
     known
@@ -268,7 +268,7 @@ def _read_control_mesh(
     mesh: UsdGeom.Mesh,
     time: Usd.TimeCode,
     materials: FaceMaterials,
-    level: int,
+    level: int | None,
     report: Reporter,
     deformation: Deformation | None,
 ) -> _ControlMesh | None:
@@ -287,13 +287,14 @@ def _read_control_mesh(
     elif scheme not in ("none", "catmullClark", "bilinear", "loop"):
         report(prim, "subdivisionScheme", f"'{scheme}' is no subdivision scheme; the mesh is taken as polygons.")
         scheme = "none"
+    if level is None:
+        scheme = "none"
     boundary = str(mesh.GetInterpolateBoundaryAttr().Get(time))
     creases, shown = NO_CREASES, _shown_faces(mesh, time, len(counts), report)
     if scheme in ("catmullClark", "loop"):
         creases = read_creases(mesh, time, counts, indices, report)
         if boundary == "none":
             shown &= ~faces_without_a_surface(counts, indices, creases)
-    refined = scheme != "none"
 
     sizes = Topology(len(points), counts, indices)
     rows = materials.rows(len(counts))
@@ -310,7 +311,7 @@ def _read_control_mesh(
         counts=counts,
         indices=indices,
         scheme=scheme,
-        level=_affordable_level(len(indices), level, prim, report) if refined else 0,
+        level=0 if level is None or scheme == "none" else _affordable_level(len(indices), level, prim, report),
         sharp_corners=boundary != "edgeOnly",
         creases=creases,
         left_handed=str(mesh.GetOrientationAttr().Get(time)) == "leftHanded",

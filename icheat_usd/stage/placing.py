@@ -31,7 +31,7 @@ class GeometryBuilder:
     materials
         Where bound materials get their rows.
     level
-        Subdivision steps.
+        Subdivision steps, or None for control meshes.
     purposes
         Purposes that are shown.
     material_purpose
@@ -44,7 +44,7 @@ class GeometryBuilder:
         self,
         time: Usd.TimeCode,
         materials: MaterialLibrary,
-        level: int,
+        level: int | None,
         purposes: Sequence[str],
         material_purpose: str,
         report: Reporter,

@@ -41,7 +41,7 @@ def take_snapshot(
     time: float | None = None,
     width: int | None = None,
     height: int | None = None,
-    subdivision_level: int = 2,
+    subdivision_level: int | None = 2,
     purposes: Sequence[str] | None = None,
     product: str | None = None,
     progress: Progress = silent,
@@ -60,7 +60,7 @@ def take_snapshot(
     width, height : pixels
         By default as the render settings say, else 640 wide with the camera's aspect.
     subdivision_level
-        Steps of subdivision surfaces.
+        Steps of subdivision surfaces; None shows their control meshes as they are, in a fraction of the time.
     purposes
         Purposes that are shown; by default the render settings' included ones, else "default" and "render".
     product
@@ -78,7 +78,7 @@ def take_snapshot(
     StageError
         No camera can be chosen, or the chosen one cannot be used.
     """
-    if subdivision_level < 0:
+    if subdivision_level is not None and subdivision_level < 0:
         raise StageError(f"The subdivision level is {subdivision_level}; give 0 or more.")
     code = time if time is not None else _start_time(stage)
     when = Usd.TimeCode.EarliestTime() if code is None else Usd.TimeCode(code)

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from queue import SimpleQueue
 from typing import NamedTuple
 
 import pytest
@@ -16,7 +17,16 @@ from icheat_usd.cli import main
 from icheat_usd.errors import IcheatError
 from icheat_usd.kernels._signatures import UnlistedTypeError, decode, dispatchers, encode, kernels_called
 from icheat_usd.session import warming
-from icheat_usd.session.warming import PURPOSES, RARE, Listed, compile_ahead, listed
+from icheat_usd.session.warming import (
+    LIVE_PURPOSES,
+    PURPOSES,
+    RARE,
+    Listed,
+    are_compiled,
+    compile_ahead,
+    compile_in_turn,
+    listed,
+)
 from tools.kernel_list import TASKS, rare, recorded
 
 
@@ -102,10 +112,10 @@ class FakeWorker:
 
     events: list[tuple[str, str]]
 
-    def compile(self, entry: Listed) -> str:
+    def begin(self, entry: Listed, answers: SimpleQueue[tuple[object, str]]) -> None:
         self.events.append(("begins", entry.kernel))
         self.events.append(("ends", entry.kernel))
-        return "its reason" if entry.kernel == "a.broken" else ""
+        answers.put((self, "its reason" if entry.kernel == "a.broken" else ""))
 
     def end(self) -> None:
         self.events.append(("stopped", ""))
@@ -132,6 +142,37 @@ def test_what_is_called_is_compiled_before_its_callers_and_the_rest_is_left(
     assert said == sorted(said) and said[-1] == 1.0
     assert compile_ahead(("live",), jobs) == 0, "it is known to be complete"
     assert compile_ahead(("live", "relight"), jobs) == 5
+
+
+def test_in_turn_the_first_purpose_comes_first_and_each_is_marked_when_it_is_done(
+    listing: pytest.MonkeyPatch,
+) -> None:
+    entries = (
+        entry("a.later", "b.shared", purposes=("live",), size=50),
+        entry("b.shared", purposes=("live", "look"), size=3),
+        entry("c.main", "b.shared", purposes=("live", "look")),
+        entry("d.middle", "c.main", purposes=("live", "preview")),
+        entry("e.other", purposes=("render",)),
+    )
+    events: list[tuple[str, str]] = []
+    listing.setattr(warming, "listed", lambda: entries)
+    listing.setattr(warming, "_Worker", type("Worker", (FakeWorker,), {"events": events}))
+    listing.setattr(warming, "available_cores", lambda: 1)
+    said: list[tuple[str, float]] = []
+    compile_in_turn(LIVE_PURPOSES, lambda purpose, share: said.append((purpose, share)))
+    begun = [kernel for event, kernel in events if event == "begins"]
+    assert begun == ["b.shared", "c.main", "d.middle", "a.later"]
+    shares = {purpose: [share for name, share in said if name == purpose] for purpose in LIVE_PURPOSES}
+    assert shares["look"][:3] == [0.0, 0.75, 1.0] and all(found == sorted(found) for found in shares.values())
+    assert all(found[-1] == 1.0 for found in shares.values())
+    assert are_compiled(LIVE_PURPOSES) and not are_compiled(["render"])
+
+    def close(purpose: str, share: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compile_in_turn(["render"], close)
+    assert events[-1] == ("stopped", "") and not are_compiled(["render"])
 
 
 def test_a_kernel_that_does_not_compile_is_named_and_nothing_is_marked_complete(

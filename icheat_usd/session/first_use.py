@@ -1,0 +1,67 @@
+"""What a live session needs compiled, in the order in which it needs it, while it shows what it can."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Sequence
+
+from icheat_usd.errors import IcheatError
+from icheat_usd.progress import Progress
+from icheat_usd.session.warming import LIVE_PURPOSES, STEP, are_compiled, compile_in_turn, may_help
+
+#: From one report to the next, for who waits.
+_REPORT_SECONDS = 0.1
+
+
+class FirstUse:
+    """Compiles in processes of its own, where it has not been done; close it to end them.
+
+    Where that can't help, each kernel is compiled when it is called.
+    """
+
+    def __init__(self, purposes: Sequence[str] = LIVE_PURPOSES) -> None:
+        self._shares = dict.fromkeys(purposes, 0.0)
+        self._changed = threading.Condition()
+        self._is_over = not may_help() or are_compiled(purposes)
+        self._thread = threading.Thread(target=self._compile, name="icheat first use", daemon=True)
+        if not self._is_over:
+            self._thread.start()
+
+    def is_done(self, purpose: str) -> bool:
+        """Whether all that the purpose calls is compiled, or will not be here."""
+        return self._is_over or self._shares[purpose] == 1.0
+
+    def wait(self, purpose: str, progress: Progress) -> None:
+        """Until it is done; what `progress` raises ends the waiting."""
+        while not self.is_done(purpose):
+            progress(STEP, self._shares[purpose])
+            with self._changed:
+                self._changed.wait(_REPORT_SECONDS)
+
+    def close(self) -> None:
+        """What has been compiled stays; the rest is compiled when it is called, or by the next session."""
+        self._is_over = True
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _compile(self) -> None:
+        try:
+            compile_in_turn(tuple(self._shares), self._report)
+        except _ClosedError:
+            pass
+        except IcheatError as error:
+            warnings.warn(f"{error}; it is compiled when it is called", stacklevel=1)
+        finally:
+            self._is_over = True
+
+    def _report(self, purpose: str, share: float) -> None:
+        if self._is_over:
+            raise _ClosedError
+        with self._changed:
+            self._shares[purpose] = share
+            self._changed.notify_all()
+
+
+class _ClosedError(Exception):
+    """Nobody needs it any more."""
