@@ -75,12 +75,13 @@ def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Ma
 
     For frames, where chains of short steps leave workers idle: each of the two threads has half of the workers until
     the other has nothing to do, of which it hears where it asks `take_back`. Where kernels may not overlap, all is done
-    one after the other: the work, but for pieces that it asks for by `do_pieces`, and then those.
+    one after the other: the work, and then the pieces.
 
     Parameters
     ----------
     pieces
-        Independent of one another, of a fraction of a millisecond and more.
+        Independent of one another, of a fraction of a millisecond and more. One may wait for what the work does, if
+        that comes also where the work fails; the work waits for none.
 
     Raises
     ------
@@ -117,16 +118,6 @@ def take_back() -> None:
     pair = _pair.get()
     if pair is not None and pair.aside is not None and (pair.is_waited_for or pair.aside.done()):
         numba.set_num_threads(pair.n_threads)
-
-
-def do_pieces() -> None:
-    """Within the work of `beside`: do the pieces that nobody has begun, of which something is needed now.
-
-    Pieces depend on nothing that the work does, so the work may wait for one that has begun.
-    """
-    pair = _pair.get()
-    if pair is not None:
-        _do_what_is_left(pair.left)
 
 
 @cache

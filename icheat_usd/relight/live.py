@@ -18,7 +18,7 @@ from icheat_usd.errors import EditError, SampleSetMismatch
 from icheat_usd.kernels import terms as kernels
 from icheat_usd.kernels.assemble import sum_scaled
 from icheat_usd.kernels.film_table import FilmTable, film_table
-from icheat_usd.kernels.workers import beside, do_pieces
+from icheat_usd.kernels.workers import beside
 from icheat_usd.relight.alone import AloneSamples
 from icheat_usd.relight.amount_films import AmountFilms
 from icheat_usd.relight.compiled import Way
@@ -476,13 +476,10 @@ class LiveRelighter:
             finally:
                 is_seen.set()
 
-        def look() -> None:
-            do_pieces()
-            is_seen.wait()
-
         # Many versions keep all workers busy, and have them from the start.
         if self._versions.has_work and self._versions.n_multiplied <= MOST_BESIDE * self._products.n_tiles:
-            beside(partial(self._versions.update, look), [unedited])
+            # What takes longer is the work, which begins sooner than what is beside it.
+            beside(unedited, [partial(self._versions.update, is_seen.wait)])
         else:
             unedited()
             self._versions.update()

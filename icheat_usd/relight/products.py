@@ -88,6 +88,7 @@ class _Tiles:
         # Also of what is narrower, so that nothing that was there before stays.
         self._is_empty: Bool = np.diff(self._tiles.tile_begin) == 0 if narrow_of is None else narrow_of._is_empty
         self._columns: TermColumns | None = None
+        self._every: dict[tuple[int, int], _Jobs] = {}  # of `multiply_one`
 
     def order(self, n_leaves: int) -> None:
         """Have terms found by their coefficients from now on, in `multiply` with `has_few`."""
@@ -109,11 +110,27 @@ class _Tiles:
         No pair is there twice. Where a lobe has no coefficients, `out` stays as it is: 0. Which versions have few
         large terms (n_versions,) matters to time alone; it needs `order`. Without it, all terms are looked at.
         """
-        assert out.flags.c_contiguous  # a copy would be written to, and lost
+        self._multiply(versions, size, least, self._jobs(tile, version, place, out.shape[1]), out, has_few)
+
+    def multiply_one(
+        self, versions: F32, size: F32, least: F32, out: F32, step: int = 1, has_few: Bool | None = None
+    ) -> None:
+        """Products of every `step`-th tile and version 0, to `out` from its start on; else as `multiply`."""
+        width = out.shape[1]
+        if (step, width) not in self._every:
+            tile = np.arange(0, self.n_tiles, step, dtype=np.int32)
+            self._every[step, width] = self._jobs(tile, 0 * tile, np.arange(len(tile)), width)
+        self._multiply(versions, size, least, self._every[step, width], out, has_few)
+
+    def _jobs(self, tile: I32, version: I32, place: I64, width: int) -> _Jobs:
+        """Of all lobes; `width` is how many places each of them has."""
         lobe = np.arange(self.n_lobes, dtype=np.int32)[:, None]
-        tiles, places = tile + self.n_tiles * lobe, place.astype(np.int32) + out.shape[1] * lobe
+        tiles, places = tile + self.n_tiles * lobe, place.astype(np.int32) + width * lobe
         is_there = ~self._is_empty[tiles]
-        jobs = _Jobs(tiles[is_there], np.broadcast_to(version, tiles.shape)[is_there], places[is_there])
+        return _Jobs(tiles[is_there], np.broadcast_to(version, tiles.shape)[is_there], places[is_there])
+
+    def _multiply(self, versions: F32, size: F32, least: F32, jobs: _Jobs, out: F32, has_few: Bool | None) -> None:
+        assert out.flags.c_contiguous  # a copy would be written to, and lost
         flat = out.reshape(-1, LANES, 4)
         if has_few is None:
             multiply_terms(*self._tiles, versions, size, least, *jobs, flat)
@@ -402,7 +419,7 @@ class Products:
                 for lobe, rows in enumerate(self._rows):
                     self._multiply_floats(rows, values, tile, 0 * tile, out[lobe, : self.n_tiles])
             else:
-                tiles.multiply(values, _NONE, _NONE[0], tile, 0 * tile, tile.astype(np.int64), out)
+                tiles.multiply_one(values, _NONE, _NONE[0], out)
             if known is not None:
                 known(out, tile)
             return
@@ -410,18 +427,19 @@ class Products:
         largest_channels(np.zeros(1, np.int64), values, size)
         size[0, 0] = np.inf  # means stay, however dark it is
         # How bright the image is follows from this light, not from the last frame: the same light, the same bits.
-        some = tile[:: max(1, len(tile) // _TILES_LOOKED_AT)]
+        step = max(1, len(tile) // _TILES_LOOKED_AT)
+        some = tile[::step]
         looked_at = self.room(len(some))
-        tiles.multiply(values, _NONE, _NONE[0], some, 0 * some, np.arange(len(some)), looked_at)
+        tiles.multiply_one(values, _NONE, _NONE[0], looked_at, step)
         if known is not None:
             known(looked_at, some)
         self.see(looked_at, some)
-        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
         if seen is not None:
             seen()
+        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
         leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
         take_back()
-        tiles.multiply(values, size, leasts, tile, 0 * tile, tile.astype(np.int64), out, np.zeros(1, np.bool_))
+        tiles.multiply_one(values, size, leasts, out, has_few=np.zeros(1, np.bool_))
         if known is not None:
             known(out, tile)
 

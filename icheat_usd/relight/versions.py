@@ -278,12 +278,12 @@ class Versions:
         """Whether there is something to multiply in `update`."""
         return bool(self._stale)
 
-    def update(self, look: Callable[[], None] | None = None) -> None:
+    def update(self, look: Callable[[], object] | None = None) -> None:
         """Evaluate what has changed since the last time; `look` returns once products of new light may be made."""
         self._evaluate(look)
         self._add_up()
 
-    def _evaluate(self, look: Callable[[], None] | None) -> None:
+    def _evaluate(self, look: Callable[[], object] | None) -> None:
         if not self._stale:
             return
         assert self._light is not None

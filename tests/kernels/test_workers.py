@@ -13,7 +13,7 @@ import pytest
 
 from icheat_usd.kernels._jit import kernels_may_overlap
 from icheat_usd.kernels.compiling import told_of_compiling
-from icheat_usd.kernels.workers import beside, do_pieces, overlapping, take_back
+from icheat_usd.kernels.workers import beside, overlapping, take_back
 
 
 @numba.njit(parallel=True, nogil=True)
@@ -194,22 +194,18 @@ def test_with_one_worker_pieces_follow_the_work() -> None:
 
 
 @pytest.mark.parametrize("n_threads", [1, 2])
-def test_work_can_wait_for_a_piece_whoever_does_it(n_threads: int) -> None:
-    made = threading.Event()
-
-    def work() -> bool:
-        do_pieces()
-        return made.wait(10)
+def test_a_piece_may_wait_for_what_the_work_does(n_threads: int) -> None:
+    made, waited = threading.Event(), []
 
     before = numba.get_num_threads()
     numba.set_num_threads(min(n_threads, before))
     try:
         for _ in range(50):
             made.clear()
-            assert beside(work, [made.set]), "nobody did the piece"
+            beside(made.set, [lambda: waited.append(made.wait(10))])
     finally:
         numba.set_num_threads(before)
-    do_pieces()  # which means nothing elsewhere
+    assert waited == 50 * [True]
 
 
 @pytest.mark.parametrize("fails", ["work", "piece"])
