@@ -26,16 +26,16 @@ def surfaces_by_headlight(view: ViewSamples) -> F32:
     return image
 
 
-def rough_surfaces(snapshot: SceneSnapshot) -> F32:
+def rough_surfaces(snapshot: SceneSnapshot) -> F32 | None:
     """The same without any kernel, while they are being compiled: one flat colour for each triangle, one ray a pixel.
 
-    Black where a scene has too many triangles to be looked at so.
+    None where there are no triangles, or too many to be looked at so.
     """
     camera, geometry = snapshot.camera, snapshot.geometry
     image = np.zeros((camera.height, camera.width, 3), np.float32)
     sizes = np.diff(geometry.mesh_begin)[geometry.instance_mesh]
     if not 0 < sizes.sum() <= _MOST_TRIANGLES:
-        return image
+        return None
     corners, row = _placed(geometry, sizes)
     origins, directions = _central_rays(camera)
     hit = nearest_triangles(corners, origins, directions)

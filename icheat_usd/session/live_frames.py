@@ -310,7 +310,9 @@ class LiveFrames:
         shot.progress = silent
         with self.stage_lock:
             snapshot = shot.rough_snapshot()
-        self._tell(LiveEvent("surfaces", number, Level.NONE, image=rough_surfaces(snapshot)))
+        look = rough_surfaces(snapshot)
+        if look is not None:
+            self._tell(LiveEvent("surfaces", number, Level.NONE, image=look))
 
     def _evaluator(
         self, parts: ShotParts, frame: LiveFrame, transport: Transport | PackedTransport, level: Level
