@@ -71,16 +71,24 @@ def _piece_products(now, before, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _take_proportional(now, before, factor, rest, size):  # type: ignore[no-untyped-def]
-    left, whole = np.float32(0), np.float32(0)
-    of_left, of_whole = 0.0, 0.0
+    # Of each channel by itself: one sum of all would wait for every addition.
+    left_r = left_g = left_b = whole_r = whole_g = whole_b = np.float32(0)
+    of_left_r = of_left_g = of_left_b = of_whole_r = of_whole_g = of_whole_b = 0.0
+    fr, fg, fb = factor[0], factor[1], factor[2]
     for k in range(len(now)):
-        for c in range(3):
-            value = now[k, c] - factor[c] * before[k, c]
-            rest[k, c] = value
-            left, whole = max(left, abs(value)), max(whole, abs(now[k, c]))
-            of_left += np.float64(value) * np.float64(value)
-            of_whole += np.float64(now[k, c]) * np.float64(now[k, c])
-    size[0], size[1], size[2], size[3] = left, whole, of_left, of_whole
+        r, g, b = now[k, 0], now[k, 1], now[k, 2]
+        x, y, z = r - fr * before[k, 0], g - fg * before[k, 1], b - fb * before[k, 2]
+        rest[k, 0], rest[k, 1], rest[k, 2] = x, y, z
+        left_r, left_g, left_b = max(left_r, abs(x)), max(left_g, abs(y)), max(left_b, abs(z))
+        whole_r, whole_g, whole_b = max(whole_r, abs(r)), max(whole_g, abs(g)), max(whole_b, abs(b))
+        of_left_r += np.float64(x) * np.float64(x)
+        of_left_g += np.float64(y) * np.float64(y)
+        of_left_b += np.float64(z) * np.float64(z)
+        of_whole_r += np.float64(r) * np.float64(r)
+        of_whole_g += np.float64(g) * np.float64(g)
+        of_whole_b += np.float64(b) * np.float64(b)
+    size[0], size[1] = max(left_r, left_g, left_b), max(whole_r, whole_g, whole_b)
+    size[2], size[3] = of_left_r + of_left_g + of_left_b, of_whole_r + of_whole_g + of_whole_b
 
 
 @parallel_kernel
