@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import pkgutil
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,9 @@ from typing import Any
 
 from numba.core import types
 from numba.core.dispatcher import Dispatcher
+
+#: What a line of standard output begins with that answers; see `work`.
+ANSWER = "icheat: "
 
 
 class UnlistedTypeError(TypeError):
@@ -80,15 +84,22 @@ def kernels_called(dispatcher: Dispatcher) -> list[str]:
 def work() -> None:
     """Compile the kernels that standard input names, and answer each with what went wrong.
 
-    A line of input is JSON, ``[kernel, [type, ...]]``; an answer is a string, empty if nothing went wrong.
+    A line of input is JSON, ``[kernel, [type, ...]]``; an answer is `ANSWER` and a string, empty if nothing went wrong.
+    What else writes to standard output, such as Numba's diagnostics, writes to standard error.
     """
-    kernels = dict(dispatchers())
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     for line in sys.stdin:
         name, words = json.loads(line)
-        message = "" if name in kernels else "there is no such kernel"
+        module, _, function = name.partition(".")
+        message = ""
         try:
-            if name in kernels:
-                kernels[name].compile(tuple(map(decode, words)))
+            # What is not asked for is not imported: to import all kernels takes seconds.
+            kernel = getattr(importlib.import_module(f"{__package__}.{module}"), function, None)
+            if kernel is None:
+                message = "there is no such kernel"
+            else:
+                kernel.compile(tuple(map(decode, words)))
         except Exception as error:  # whatever it is, the other kernels do not suffer for it
             message = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        print(json.dumps(message), flush=True)
+        print(ANSWER + json.dumps(message), file=answers, flush=True)

@@ -71,7 +71,7 @@ def overlapping(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
 
 
 def beside(work: Callable[[], Made], pieces: Sequence[Callable[[], None]]) -> Made:
-    """Do some work while another thread does pieces that do not depend on it; at last this one helps with the pieces.
+    """Do some work while another thread does pieces beside it; at last this one helps with the pieces.
 
     For frames, where chains of short steps leave workers idle: each of the two threads has half of the workers until
     the other has nothing to do, of which it hears where it asks `take_back`. Where kernels may not overlap, all is done

@@ -15,6 +15,9 @@ _EDGE = 0.25
 #: Of all placed triangles, beyond which copies of them would take too long to make.
 _MOST_TRIANGLES = 4_000_000
 
+#: Of a texture, that its mean is taken of.
+_MOST_TEXELS = 65_521  # a prime: steps through an image do not follow its columns
+
 
 def surfaces_by_headlight(view: ViewSamples) -> F32:
     """The surfaces in their colours, darker towards their edges, (height, width, 3) scene-linear.
@@ -65,14 +68,15 @@ def _placed(geometry: Geometry, sizes: I64) -> tuple[F32, I64]:
 
 
 def _central_rays(camera: Camera) -> tuple[F64, F64]:
-    """Origins and unit directions (n_pixels, 3) through the middle of each pixel and of the lens."""
+    """Origins, on the near plane, and unit directions (n_pixels, 3) through the middles of the pixels and the lens."""
     left, right, bottom, top = camera.window
     x = left + (np.arange(camera.width) + 0.5) / camera.width * (right - left)
     y = top - (np.arange(camera.height) + 0.5) / camera.height * (top - bottom)
     plane = np.stack([*np.broadcast_arrays(x[None], y[:, None]), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
     forward = np.array([0.0, 0.0, -1.0])
     local = (plane, np.broadcast_to(forward, plane.shape)) if camera.orthographic else (0 * plane, plane + forward)
-    origins = local[0] @ camera.to_world[:, :3].T + camera.to_world[:, 3]
+    # In front of the camera -z is 1 on the plane of the window, so this scales directions to the near plane.
+    origins = (local[0] + camera.near * local[1]) @ camera.to_world[:, :3].T + camera.to_world[:, 3]
     directions = local[1] @ camera.to_world[:, :3].T
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -94,11 +98,12 @@ def _diffuse(snapshot: SceneSnapshot, material: int) -> F32:
         return constant
     textures = snapshot.textures
     begin = int(textures.begin[texture])
-    texels = textures.texels[begin : begin + int(textures.width[texture]) * int(textures.height[texture])]
+    n = int(textures.width[texture]) * int(textures.height[texture])
+    texels = textures.texels[begin : begin + n : 1 + n // _MOST_TEXELS].astype(np.float64)
     scale, bias = materials.texture_scale[material, Texture.DIFFUSE], materials.texture_bias[material, Texture.DIFFUSE]
     # What is see-through does not count: leaves are often green on white.
     weight = np.maximum(texels[:, 3:], 1e-6)
     mean = (texels * weight).sum(axis=0) / weight.sum() * scale + bias
     channel = int(materials.texture_channel[material, Texture.DIFFUSE])
-    colour: F32 = mean[:3] if channel < 0 else np.repeat(mean[channel], 3)
+    colour: F32 = (mean[:3] if channel < 0 else np.repeat(mean[channel], 3)).astype(np.float32)
     return colour

@@ -15,12 +15,13 @@ _REPORT_SECONDS = 0.1
 
 
 class FirstUse:
-    """Compiles in processes of its own, where it has not been done; close it to end them.
+    """Compiles in processes of its own, where it has not been done, until nobody wants it any more.
 
     Where that can't help, each kernel is compiled when it is called.
     """
 
     def __init__(self, purposes: Sequence[str] = LIVE_PURPOSES) -> None:
+        self.users = set[int]()  #: by `id`
         self._shares = dict.fromkeys(purposes, 0.0)
         self._changed = threading.Condition()
         self._is_over = not may_help() or are_compiled(purposes)
@@ -28,8 +29,13 @@ class FirstUse:
         if not self._is_over:
             self._thread.start()
 
+    @property
+    def is_over(self) -> bool:
+        """Whether all is compiled, or what is not will not be here."""
+        return self._is_over
+
     def is_done(self, purpose: str) -> bool:
-        """Whether all that the purpose calls is compiled, or will not be here."""
+        """Whether that is so for all that the purpose calls."""
         return self._is_over or self._shares[purpose] == 1.0
 
     def wait(self, purpose: str, progress: Progress) -> None:
@@ -50,7 +56,7 @@ class FirstUse:
             compile_in_turn(tuple(self._shares), self._report)
         except _ClosedError:
             pass
-        except IcheatError as error:
+        except (IcheatError, OSError) as error:
             warnings.warn(f"{error}; it is compiled when it is called", stacklevel=1)
         finally:
             self._is_over = True
@@ -65,3 +71,29 @@ class FirstUse:
 
 class _ClosedError(Exception):
     """Nobody needs it any more."""
+
+
+_lock = threading.Lock()
+_shared: list[FirstUse] = []  # one at most: sessions that are opened together would compile the same
+
+
+def begin_use(user: object) -> FirstUse:
+    """The one of this process, begun if need be; to be ended by `end_use`."""
+    with _lock:
+        if not _shared or _shared[0].is_over:
+            _shared[:] = [FirstUse()]
+        _shared[0].users.add(id(user))
+        return _shared[0]
+
+
+def end_use(use: FirstUse, user: object) -> None:
+    """One user less; the last one closes it. Ending twice does nothing."""
+    with _lock:
+        if id(user) not in use.users:
+            return
+        use.users.discard(id(user))
+        is_last = not use.users
+        if is_last and use in _shared:
+            _shared.clear()
+    if is_last:
+        use.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from weakref import WeakMethod
 
 from icheat_usd.edits.model import EMPTY_STACK, EditStack
@@ -23,7 +23,7 @@ from icheat_usd.session.dabs import TexelPlaces
 from icheat_usd.session.document import Session
 from icheat_usd.session.evaluator import Evaluator
 from icheat_usd.session.first_look import rough_surfaces, surfaces_by_headlight
-from icheat_usd.session.first_use import FirstUse
+from icheat_usd.session.first_use import begin_use, end_use
 from icheat_usd.session.frames import ResidentFrames, SharedParts, share_tables
 from icheat_usd.session.live_events import Level, Listener, LiveEvent
 from icheat_usd.session.live_state import UNCHANGED, LiveState
@@ -77,7 +77,7 @@ class LiveFrames:
         self._building_version = 0  #: of the lights in `_building`
         self._asked: tuple[float | None, Level] = (None, Level.NONE)  #: what the background is to make
         self._job: tuple[float | None, Level] = self._asked  #: what it makes for that, which may be better
-        self._first_use = FirstUse()
+        self._first_use = begin_use(self)
         start_workers()
         self._background = Background(self._next_job, self._on_error, kernels_may_overlap, give_freed_memory_back)
         self._background.start()
@@ -199,7 +199,7 @@ class LiveFrames:
 
     def close(self) -> None:
         self._background.close()
-        self._first_use.close()
+        end_use(self._first_use, self)
 
     def _changed(self) -> None:
         """What is shown is to be refined again."""
@@ -306,11 +306,15 @@ class LiveFrames:
         """Show the surfaces while what would show them better is compiled."""
         if self.resident.get(number) is not None:
             return
-        shot = self.session.at(number)
-        shot.progress = silent
-        with self.stage_lock:
-            snapshot = shot.rough_snapshot()
-        look = rough_surfaces(snapshot)
+        look = None
+        # What is wrong with the stage is told by who reads it in earnest; whatever else fails here is no loss.
+        with suppress(Exception):
+            shot = self.session.at(number)
+            shot.progress = silent
+            with self.stage_lock:
+                snapshot = shot.rough_snapshot()
+            self._background.progress()
+            look = rough_surfaces(snapshot)
         if look is not None:
             self._tell(LiveEvent("surfaces", number, Level.NONE, image=look))
 

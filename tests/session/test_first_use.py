@@ -16,7 +16,7 @@ from icheat_usd.resources import resource_path
 from icheat_usd.scene import F32
 from icheat_usd.session import Session, first_look, first_use, live_frames, warming
 from icheat_usd.session.first_look import rough_surfaces, surfaces_by_headlight
-from icheat_usd.session.first_use import FirstUse
+from icheat_usd.session.first_use import FirstUse, begin_use, end_use
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_events import LiveEvent
 from icheat_usd.session.quality import DRAFT
@@ -111,6 +111,20 @@ def test_a_texture_counts_with_the_mean_of_what_is_not_see_through(tmp_path: Pat
     np.testing.assert_allclose(rough(stage)[30, 30], (0.2, 0.4, 0.1), rtol=1e-3)
 
 
+def test_what_lies_before_the_near_plane_is_not_seen() -> None:
+    stage = plates(orthographic=False)
+    mesh = UsdGeom.Mesh.Define(stage, "/Near")
+    mesh.CreatePointsAttr([(-1, -1, 4.5), (1, -1, 4.5), (1, 1, 4.5), (-1, 1, 4.5)])
+    mesh.CreateFaceVertexCountsAttr([4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    mesh.CreateDisplayColorAttr([(0.0, 1.0, 0.0)])
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/Camera"))
+    camera.CreateClippingRangeAttr(Gf.Vec2f(1, 100))
+    assert rough(stage)[30, 30, 0] > rough(stage)[30, 30, 1]
+    camera.GetClippingRangeAttr().Set(Gf.Vec2f(0.1, 100))
+    assert rough(stage)[30, 30, 0] < rough(stage)[30, 30, 1]
+
+
 def test_what_has_too_many_triangles_is_not_looked_at_roughly(monkeypatch: pytest.MonkeyPatch) -> None:
     snapshot = Session.open(plates(orthographic=True), width=8, height=8, quality=DRAFT).rough_snapshot()
     assert rough_surfaces(snapshot) is not None
@@ -183,6 +197,33 @@ def test_what_waits_can_leave_and_what_compiles_ends_when_it_is_closed(monkeypat
     use.close()
 
 
+def test_sessions_of_a_process_share_it_and_the_last_one_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, ended = [], threading.Event()
+
+    def compile_in_turn(purposes: Sequence[str], report: Report) -> None:
+        begun.append(purposes)
+        try:
+            while True:
+                report("look", 0.1)
+                ended.wait(0.01)
+        finally:
+            ended.set()
+
+    compiling(monkeypatch, compile_in_turn)
+    first, second = object(), object()
+    use = begin_use(first)
+    assert begin_use(second) is use
+    end_use(use, first)
+    end_use(use, first)
+    assert not ended.is_set() and not use.is_over
+    end_use(use, second)
+    assert ended.is_set() and use.is_over and len(begun) == 1
+    end_use(use, second)
+    another = begin_use(first)
+    assert another is not use
+    end_use(another, first)
+
+
 def test_a_kernel_that_does_not_compile_ahead_is_told_and_left_to_whoever_calls_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -231,10 +272,8 @@ def test_a_live_session_shows_surfaces_before_any_kernel_and_again_before_there_
             order.append(purpose)
             self._waited.add(purpose)
 
-        def close(self) -> None:
-            pass
-
-    monkeypatch.setattr(live_frames, "FirstUse", Slow)
+    monkeypatch.setattr(live_frames, "begin_use", lambda user: Slow())
+    monkeypatch.setattr(live_frames, "end_use", lambda use, user: None)
     images: list[LiveEvent] = []
 
     def heard(event: LiveEvent) -> None:

@@ -193,7 +193,11 @@ def test_processes_compile_into_the_cache_and_answer_for_what_they_can_not(
     real = [one for one in listed() if one.kernel == "random.to_unit"]
     assert real
     listing.setattr(warming, "listed", lambda: tuple(real))
+    # An interpreter may have something to say when it starts.
+    (tmp_path / "sitecustomize.py").write_text("print('hello from the studio')")
+    listing.setenv("PYTHONPATH", str(tmp_path))
     assert compile_ahead(real[0].purposes, 2) == len(real)
+    listing.delenv("PYTHONPATH")
     words = json.dumps(real[0].types)
     code = (
         "import json; from icheat_usd.kernels.random import to_unit as kernel;"
