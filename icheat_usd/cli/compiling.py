@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import sys
 
-from icheat_usd.errors import IcheatError
 from icheat_usd.progress import Progress
 
 
 def compile_first(purpose: str, progress: Progress) -> None:
-    """Compile what one of `session.warming.PURPOSES` needs; a failure is told, and left to whoever calls the kernel."""
-    from icheat_usd.session.warming import compile_ahead, may_help
+    """As `session.first_use.compile_first`; it is imported when it is needed, as the compiler takes long to load."""
+    from icheat_usd.session import first_use
 
-    if not may_help():  # Kernels are then compiled as they are called, and no others.
-        return
-    try:
-        compile_ahead((purpose,), progress=progress)
-    except IcheatError as error:
-        print(f"icheat: warning: {error}; it is compiled when it is called", file=sys.stderr)
+    first_use.compile_first(purpose, progress, lambda text: print(f"icheat: warning: {text}", file=sys.stderr))

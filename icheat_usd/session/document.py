@@ -19,6 +19,7 @@ from icheat_usd.progress import Progress, silent
 from icheat_usd.scene import Finding, SceneSnapshot
 from icheat_usd.session import authoring, films, keys, layer_names
 from icheat_usd.session.disk_cache import DiskCache
+from icheat_usd.session.first_use import compile_first
 from icheat_usd.session.quality import FINAL, PREVIEW, Quality
 from icheat_usd.session.rendering import render_film
 from icheat_usd.session.shot_parts import Memory, ShotParts
@@ -206,6 +207,7 @@ class Session(ShotParts):
         Film
             Layers `beauty`, `direct`, `indirect`, `indirect_edited`, `edit_delta`, `albedo`, `normal`, `depth`.
         """
+        compile_first("relight", self.progress)
         stack = self.stack
         field = bind(stack, self.snapshot)
         relighter = self.relighter
@@ -227,6 +229,7 @@ class Session(ShotParts):
             There is no such layer; the message lists those there are.
         """
         sources = [layer_names.canonical(name) for name in layers]
+        compile_first("render", self.progress)
         return render_film(
             self, settings, [layer_names.Layer(source, layer_names.layer_name(source)) for source in sources]
         )
@@ -235,6 +238,7 @@ class Session(ShotParts):
         """Render a final frame and keep what its rays brought, to make it again whenever edits have changed."""
         from icheat_usd.session.replaying import FrameReplay
 
+        compile_first("render", self.progress)
         return FrameReplay(self, settings, layers)
 
     def metadata(self, renderer: str, stack: EditStack, settings: Mapping[str, Any]) -> dict[str, str]:

@@ -1,23 +1,44 @@
-"""What a live session needs compiled, in the order in which it needs it, while it shows what it can."""
+"""Kernels that have not been compiled on this machine: all at once for an image, in turn for a live session."""
 
 from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from icheat_usd.errors import IcheatError
 from icheat_usd.progress import Progress
-from icheat_usd.session.warming import LIVE_PURPOSES, STEP, are_compiled, compile_in_turn, may_help
+from icheat_usd.session.warming import (
+    LIVE_PURPOSES,
+    STEP,
+    are_compiled,
+    compile_ahead,
+    compile_in_turn,
+    may_help,
+)
 
 #: From one report to the next, for who waits.
 _REPORT_SECONDS = 0.1
 
 
-class FirstUse:
-    """Compiles in processes of its own, where it has not been done, until nobody wants it any more.
+def compile_first(purpose: str, progress: Progress, warn: Callable[[str], None] = warnings.warn) -> None:
+    """Have all cores compile what one of `warming.PURPOSES` needs, where that helps.
 
-    Where that can't help, each kernel is compiled when it is called.
+    A failure is told, and left to whoever calls the kernel.
+    """
+    if not may_help():
+        return
+    try:
+        compile_ahead((purpose,), progress=progress)
+    except IcheatError as error:
+        warn(f"{error}; it is compiled when it is called")
+
+
+class FirstUse:
+    """What a live session needs, in the order in which it needs it, while it shows what it can.
+
+    Compiles in processes of its own, where it has not been done, until nobody wants it any more. Where that can't help,
+    each kernel is compiled when it is called.
     """
 
     def __init__(self, purposes: Sequence[str] = LIVE_PURPOSES) -> None:
@@ -56,7 +77,7 @@ class FirstUse:
             compile_in_turn(tuple(self._shares), self._report)
         except _ClosedError:
             pass
-        except (IcheatError, OSError) as error:
+        except IcheatError as error:
             warnings.warn(f"{error}; it is compiled when it is called", stacklevel=1)
         finally:
             self._is_over = True

@@ -250,17 +250,20 @@ class _Worker:
 
     def __init__(self) -> None:
         command = [sys.executable, "-c", "from icheat_usd.kernels._signatures import work; work()"]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            # Ctrl-C is for whoever waits, who ends this or goes on. On Windows it would open a window of its own, too.
-            start_new_session=True,
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-            | getattr(subprocess, "CREATE_NO_WINDOW", 0),
-        )
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                # Ctrl-C is for whoever waits, who ends this or goes on. On Windows it would have a window of its own.
+                start_new_session=True,
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+                | getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError as error:
+            raise IcheatError(f"no process can be started to compile kernels in: {error}") from error
 
     def begin(self, entry: Listed, answers: SimpleQueue[tuple[_Worker, str]]) -> None:
         """Have what `compile` says put there."""

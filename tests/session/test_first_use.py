@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 from icheat_usd.errors import IcheatError
 from icheat_usd.resources import resource_path
 from icheat_usd.scene import F32
-from icheat_usd.session import Session, first_look, first_use, live_frames, warming
+from icheat_usd.session import GatherSettings, Session, document, first_look, first_use, live_frames, warming
 from icheat_usd.session.first_look import rough_surfaces, surfaces_by_headlight
 from icheat_usd.session.first_use import FirstUse, begin_use, end_use
 from icheat_usd.session.live import LiveSession
@@ -290,3 +291,26 @@ def test_a_live_session_shows_surfaces_before_any_kernel_and_again_before_there_
     assert first is not None and second is not None
     np.testing.assert_allclose(first[30, 30], (0.8, 0.1, 0.1), rtol=1e-5)
     np.testing.assert_allclose(first[30, 30], second[30, 30], rtol=1e-5)
+
+
+def test_an_image_has_its_kernels_compiled_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[str] = []
+    monkeypatch.setattr(document, "compile_first", lambda purpose, progress: compiled.append(purpose))
+    session = Session.open(plates(orthographic=True), width=4, height=3, quality=replace(DRAFT, n_gather=64))
+    session.relight()
+    session.render(GatherSettings(samples_per_pixel=1, gather_rays=4, light_samples=1))
+    assert compiled == ["relight", "render"]
+
+
+def test_what_does_not_compile_first_is_told_and_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    def compile_ahead(purposes: Sequence[str], progress: object) -> int:
+        raise IcheatError(f"{purposes[0]} does not compile")
+
+    monkeypatch.setattr(first_use, "compile_ahead", compile_ahead)
+    monkeypatch.setattr(first_use, "may_help", lambda: True)
+    told: list[str] = []
+    first_use.compile_first("relight", print, told.append)
+    assert told == ["relight does not compile; it is compiled when it is called"]
+    monkeypatch.setattr(first_use, "may_help", lambda: False)
+    first_use.compile_first("relight", print, told.append)
+    assert len(told) == 1

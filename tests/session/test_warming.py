@@ -225,6 +225,13 @@ def test_a_process_that_ends_early_is_told(listing: pytest.MonkeyPatch) -> None:
         compile_ahead(("live",), 1)
 
 
+def test_a_process_that_can_not_be_started_is_told(listing: pytest.MonkeyPatch) -> None:
+    listing.setattr(warming, "listed", lambda: (entry("a.fine"),))
+    listing.setattr(warming.sys, "executable", "/there/is/no/python")
+    with pytest.raises(IcheatError, match="no process can be started to compile kernels in: .*/there/is/no/python"):
+        compile_ahead(("live",), 1)
+
+
 def test_warm_says_where_kernels_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["warm", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
