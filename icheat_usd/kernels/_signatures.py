@@ -13,9 +13,6 @@ from typing import Any
 from numba.core import types
 from numba.core.dispatcher import Dispatcher
 
-#: What a line of standard output begins with that answers; see `work`.
-ANSWER = "icheat: "
-
 
 class UnlistedTypeError(TypeError):
     """A type that a list of kernels has no word for."""
@@ -81,10 +78,10 @@ def kernels_called(dispatcher: Dispatcher) -> list[str]:
     return sorted(names)
 
 
-def work() -> None:
+def work(mark: str) -> None:
     """Compile the kernels that standard input names, and answer each with what went wrong.
 
-    A line of input is JSON, ``[kernel, [type, ...]]``; an answer is `ANSWER` and a string, empty if nothing went wrong.
+    A line of input is JSON, ``[kernel, [type, ...]]``; an answer is `mark` and a string, empty if nothing went wrong.
     What else writes to standard output, such as Numba's diagnostics, writes to standard error.
     """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
@@ -102,4 +99,4 @@ def work() -> None:
                 kernel.compile(tuple(map(decode, words)))
         except Exception as error:  # whatever it is, the other kernels do not suffer for it
             message = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        print(ANSWER + json.dumps(message), file=answers, flush=True)
+        print(mark + json.dumps(message), file=answers, flush=True)
