@@ -147,6 +147,23 @@ def compiling(monkeypatch: pytest.MonkeyPatch, compile_in_turn: Callable[[Sequen
     monkeypatch.setattr(first_use, "compile_in_turn", compile_in_turn)
 
 
+def compiling_until_closed(monkeypatch: pytest.MonkeyPatch) -> tuple[list[Sequence[str]], threading.Event]:
+    """Have compiling never come to an end by itself; what was begun, and whether it has ended."""
+    begun, ended = list[Sequence[str]](), threading.Event()
+
+    def compile_in_turn(purposes: Sequence[str], report: Report) -> None:
+        begun.append(purposes)
+        try:
+            while True:
+                report("look", 0.1)
+                ended.wait(0.01)
+        finally:
+            ended.set()
+
+    compiling(monkeypatch, compile_in_turn)
+    return begun, ended
+
+
 def test_each_purpose_is_waited_for_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
 
@@ -174,17 +191,7 @@ def test_each_purpose_is_waited_for_by_itself(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_waits_can_leave_and_what_compiles_ends_when_it_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    ended = threading.Event()
-
-    def compile_in_turn(purposes: Sequence[str], report: Report) -> None:
-        try:
-            while True:
-                report("look", 0.1)
-                ended.wait(0.01)
-        finally:
-            ended.set()
-
-    compiling(monkeypatch, compile_in_turn)
+    ended = compiling_until_closed(monkeypatch)[1]
     use = FirstUse()
 
     def stop(step: str, share: float) -> None:
@@ -199,18 +206,7 @@ def test_what_waits_can_leave_and_what_compiles_ends_when_it_is_closed(monkeypat
 
 
 def test_sessions_of_a_process_share_it_and_the_last_one_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun, ended = [], threading.Event()
-
-    def compile_in_turn(purposes: Sequence[str], report: Report) -> None:
-        begun.append(purposes)
-        try:
-            while True:
-                report("look", 0.1)
-                ended.wait(0.01)
-        finally:
-            ended.set()
-
-    compiling(monkeypatch, compile_in_turn)
+    begun, ended = compiling_until_closed(monkeypatch)
     first, second = object(), object()
     use = begin_use(first)
     assert begin_use(second) is use
