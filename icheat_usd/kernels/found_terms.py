@@ -208,14 +208,15 @@ def multiply_found(  # type: ignore[no-untyped-def]
         part = 2 * turn % PARTS + 2 * turn // PARTS
         first, last = share(cost_end, part), share(cost_end, part + 1)
         room, tables, numbers = new_room(), tables_of(index, scale, value, coefficients, out), address_of(found)
-        if first < last:
-            next_count = _prepare(found[found_begin[first] : found_begin[first + 1]], value)
-        for job in range(first, last):
-            count = next_count
-            if job + 1 < last:
-                next_count = _prepare(found[found_begin[job + 1] : found_begin[job + 2]], value)
-            number = numbers + 4 * found_begin[job]
-            n_fetched = min(count, _AHEAD)
-            work = tables, job_version[job], job_out[job], number, count, n_fetched, number, 0
-            multiply_tile(*work, address_of(room))
+        n, n_ready = 0, 0
+        for job in range(first, last + 1):
+            n_following, version = 0, 0
+            if job < last:
+                n_following = _prepare(found[found_begin[job] : found_begin[job + 1]], value)
+                version = job_version[job]
+            if job > first:
+                number, following = numbers + 4 * found_begin[job - 1], numbers + 4 * found_begin[job]
+                work = tables, job_version[job - 1], job_out[job - 1], number, n, n_ready, following, n_following
+                n_ready = multiply_tile(*work, version, address_of(room))
+            n = n_following
         room[0] = np.float32(0)  # keeps it

@@ -75,16 +75,17 @@ def _multiply_run(  # type: ignore[no-untyped-def]
     for job in range(first, last):
         most = max(most, tile_begin[job_tile[job] + 1] - tile_begin[job_tile[job]])
     rooms, room = np.empty((2, most // 2), np.int32), new_room()
-    tables, n_following, n_fetched = tables_of(index, scale, value, coefficients, out), 0, 0
+    tables, n_following, n_ready = tables_of(index, scale, value, coefficients, out), 0, 0
     for job in range(first, last + 1):
-        n, n_following = n_following, 0
+        n, n_following, version = n_following, 0, 0
         if job < last:
+            version = job_version[job]
             begin, end = tile_begin[job_tile[job]] >> 1, tile_begin[job_tile[job] + 1] >> 1
             n_following = _find_marked(begin, end, marks[job_marks[job]], rooms[job % 2])
         if job > first:
             made, number, following = job - 1, address_of(rooms[(job - 1) % 2]), address_of(rooms[job % 2])
-            work = tables, job_version[made], job_out[made], number, n, n_fetched, following, n_following
-            n_fetched = multiply_tile(*work, address_of(room))
+            work = tables, job_version[made], job_out[made], number, n, n_ready, following, n_following
+            n_ready = multiply_tile(*work, version, address_of(room))
     room[0] = np.float32(0)  # keeps it
 
 

@@ -44,9 +44,9 @@ from icheat_usd.kernels.simd import (
 
 QUANTA = 2 * LANES  #: bytes of a pair of coefficients
 _PRODUCT = 16 * LANES  # bytes of a product
-# Pairs of coefficients: their quanta are in the second-level cache before they are multiplied. Sums of twice as many
-# products of a word and a quantum, 32767 * 128 each, stay within 32 bits.
-_AT_ONCE = 128
+# Pairs of coefficients, whose quanta are in the second-level cache before they are multiplied. Sums of twice as many
+# products of a word and a quantum, 32767 * 128 each, stay within 32 bits (up to 256).
+_AT_ONCE = 48
 _COLORS = 16 * (_AT_ONCE + 4)  # bytes of a colour for each, and what is beyond the last as vectors are whole
 _SUMS = 12 * 64  # bytes
 _WORD_STEPS = 1.0 / 32767.0
@@ -85,28 +85,23 @@ def new_room() -> np.ndarray:
 
 
 @kernel
-def _scale_pairs(number: int, n: int, n_fetched: int, tables: Tables, coefficients: int, even: int, odd: int) -> None:
-    """Colours that the quanta of `n` pairs multiply, every second one apart; whole vectors, so up to three pairs more.
+def _scale_pair(pair: int, tables: Tables, light: int, even: int, odd: int) -> None:
+    """The two colours that the quanta of a pair multiply; meanwhile the quanta come into the cache."""
+    quanta, where, size = tables.value + QUANTA * pair, tables.index + 8 * pair, tables.scale + 8 * pair
+    fetch(quanta)
+    fetch(quanta + 64)
+    store_color(even, scaled(load_color(light + 16 * load_number(where)), load_one(size)))
+    store_color(odd, scaled(load_color(light + 16 * load_number(where + 4)), load_one(size + 4)))
 
-    Meanwhile the quanta come into the cache, but for those of the first pairs, which were asked for before.
-    """
-    for i in range(n):
-        pair = load_number(number)
-        if i >= n_fetched:
-            ahead = tables.value + QUANTA * pair
-            fetch(ahead)
-            fetch(ahead + 64)
-        where, size = tables.index + 8 * pair, tables.scale + 8 * pair
-        store_color(even, scaled(load_color(coefficients + 16 * load_number(where)), load_one(size)))
-        store_color(odd, scaled(load_color(coefficients + 16 * load_number(where + 4)), load_one(size + 4)))
-        number += 4
-        even += 16
-        odd += 16
-    for _ in range(-n % 4):
-        store_color(even, black())
-        store_color(odd, black())
-        even += 16
-        odd += 16
+
+@kernel
+def _scale_pairs(number: int, first: int, n: int, tables: Tables, light: int, even: int, odd: int) -> None:
+    """Colours of pairs `first` to `n`; whole vectors, so up to three pairs more."""
+    for i in range(first, n):
+        _scale_pair(load_number(number + 4 * i), tables, light, even + 16 * i, odd + 16 * i)
+    for i in range(n, n + -n % 4):
+        store_color(even + 16 * i, black())
+        store_color(odd + 16 * i, black())
 
 
 @kernel
@@ -134,17 +129,21 @@ def _add(place: int, sums: Any, step: float) -> None:
 
 @kernel
 def _multiply_pairs(
-    number: int, n: int, value: int, words: int, step: Any, ahead: int, n_ahead: int, sums: int
-) -> None:
-    """Add `n` pairs times words to 12 vectors of sums; meanwhile pairs `ahead` come into the cache, of which is one."""
+    number: int, n: int, tables: Tables, words: int, step: Any, sums: int,
+    ahead: int, n_ahead: int, light: int, even: int, odd: int,
+) -> None:  # fmt: skip
+    """Add `n` pairs times words to 12 vectors of sums.
+
+    Meanwhile as many of the pairs `ahead`, of which is one, are prepared: sums wait for multipliers alone, and one
+    after the other both took half as long again.
+    """
     r0 = r1 = r2 = r3 = g0 = g1 = g2 = g3 = b0 = b1 = b2 = b3 = no_sum()
-    last = ahead + 4 * (n_ahead - 1)
+    last, last_even = ahead + 4 * (n_ahead - 1), even + 16 * (n_ahead - 1)
+    apart = odd - even
     for _ in range(n):
-        soon = value + QUANTA * load_number(ahead)
-        fetch(soon)
-        fetch(soon + 64)
-        ahead = min(ahead + 4, last)
-        quanta = value + QUANTA * load_number(number)
+        _scale_pair(load_number(ahead), tables, light, even, even + apart)
+        ahead, even = min(ahead + 4, last), min(even + 16, last_even)
+        quanta = tables.value + QUANTA * load_number(number)
         r, g, b = spread_pair(words), spread_pair(words + 4), spread_pair(words + 8)
         x = widen(quanta)
         r0, g0, b0 = add_dot(x, r, r0), add_dot(x, g, g0), add_dot(x, b, b0)
@@ -173,8 +172,8 @@ def _multiply_pairs(
 
 @kernel
 def multiply_tile(
-    tables: Tables, version: int, to: int, number: int, n: int, n_fetched: int, following: int, n_following: int,
-    room: int,
+    tables: Tables, version: int, to: int, number: int, n: int, n_ready: int, following: int, n_following: int,
+    version_following: int, room: int,
 ) -> int:  # fmt: skip
     """Some pairs of coefficients of one tile times one version.
 
@@ -182,17 +181,17 @@ def multiply_tile(
     ----------
     version, to : number of the light, and of the product
     number, n : address of int32 numbers of the pairs, and how many they are
-    n_fetched : how many of the first of these were asked for before
-    following, n_following
-        The same of the next product, whose quanta come into the cache meanwhile; there may be none.
+    n_ready : how many of the first of these were prepared with the product before, in the same room
+    following, n_following, version_following
+        The same of the next product, of which some pairs are prepared meanwhile; there may be none.
     room : address of a `new_room`
 
     Returns
     -------
     int
-        How many of the first pairs that follow were asked for.
+        How many of the first pairs that follow are prepared.
     """
-    coefficients, out = tables.light + tables.light_step * np.int64(version), tables.out + _PRODUCT * np.int64(to)
+    light, out = tables.light + tables.light_step * np.int64(version), tables.out + _PRODUCT * np.int64(to)
     even, odd, words, sums = room, room + _COLORS, room + 2 * _COLORS, room + 3 * _COLORS
     for k in range(12):
         store(sums + 64 * k, zeros())
@@ -200,17 +199,17 @@ def multiply_tile(
     while n > 0:
         some, rest = min(n, _AT_ONCE), n - min(n, _AT_ONCE)
         end = number + 4 * some
-        _scale_pairs(number, some, n_fetched, tables, coefficients, even, odd)
+        _scale_pairs(number, n_ready, some, tables, light, even, odd)
         step = scaled(_largest(some, even, odd), np.float32(_WORD_STEPS))
         _round_pairs(some, even, odd, ratios(one, step), words)
+        ahead, n_ahead, light_ahead = number, some, light
         if rest > 0:
             ahead, n_ahead = end, min(rest, _AT_ONCE)
         elif n_following > 0:
-            ahead, n_ahead = following, n_following
-        else:
-            ahead, n_ahead = number, some
-        _multiply_pairs(number, some, tables.value, words, step, ahead, n_ahead, sums)
-        number, n, n_fetched = end, rest, min(some, n_ahead)
+            ahead, n_ahead = following, min(n_following, _AT_ONCE)
+            light_ahead = tables.light + tables.light_step * np.int64(version_following)
+        _multiply_pairs(number, some, tables, words, step, sums, ahead, n_ahead, light_ahead, even, odd)
+        number, n, n_ready = end, rest, min(some, n_ahead)
     for k in range(4):
         store_colors(out + 256 * k, load(sums + 64 * k), load(sums + 256 + 64 * k), load(sums + 512 + 64 * k))
-    return n_fetched if n_following > 0 else 0
+    return n_ready if n_following > 0 else 0
