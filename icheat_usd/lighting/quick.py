@@ -62,8 +62,7 @@ class Shadows:
         out: F32,
     ) -> None:
         """Dim what places of some runs, ascending, get through see-through surfaces; see `see_through.dim_places`."""
-        # To look whether there is anything to dim takes a tenth of what the kernel takes to find nothing.
-        if self.passing is not None and len(runs) and through[runs[0] * RUN : (runs[-1] + 1) * RUN].any():
+        if self.passing is not None:
             light = shining.table, shining.distant
             of_places = *places.table, places.row, runs, through, crossing, out
             given: tuple[Any, ...] = (*self._layers(snapshot), *light, *of_places)
