@@ -68,6 +68,7 @@ class CloserLook:
         # What was not looked at in the frame before may be far from what it was.
         self._last.forget(np.flatnonzero(self._looked_at > before))
         if not len(runs):
+            self._believe(runs, differences[runs], differences[runs])
             return
         take_back()
         direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs, told)
