@@ -44,7 +44,7 @@ def noise_of_runs(direct: np.ndarray, area: np.ndarray, begin: np.ndarray, end: 
 @parallel_kernel
 def take_closer_looks(
     runs: np.ndarray, begin: np.ndarray, end: np.ndarray, cell_begin: np.ndarray, per_run: int, looked_at: np.ndarray,
-    of_patches: np.ndarray, area: np.ndarray, direct: np.ndarray, change: np.ndarray,
+    of_patches: np.ndarray, direct: np.ndarray,
 ) -> None:  # fmt: skip
     """Give cells the mean over those of their patch points that were looked at.
 
@@ -57,15 +57,10 @@ def take_closer_looks(
         Patch points of a run.
     looked_at : (n_runs,) uint8, 1 for those of `runs`
     of_patches : (n_patches, 3), what they reflect
-    area : (n_cells,)
     direct : (n_cells, 3), changed
-    change : (n,) float64, set
-        Sums of ``(area * change of level) ** 2`` over cells that no other run shares; infinite where there is none.
     """
     for i in prange(len(runs)):
-        changed, n_whole = 0.0, 0
-        first_patch = np.int64(runs[i]) * per_run
-        # A cell that two runs share gets the same from both; another thread may be at it now.
+        # A cell that two runs share gets the same from both.
         for cell in range(begin[runs[i]], end[runs[i]]):
             n = 0
             r = g = b = np.float32(0.0)
@@ -74,9 +69,4 @@ def take_closer_looks(
                     r, g, b = r + of_patches[patch, 0], g + of_patches[patch, 1], b + of_patches[patch, 2]
                     n += 1
             share = np.float32(1.0 / n)
-            if cell_begin[cell] >= first_patch and cell_begin[cell + 1] <= first_patch + per_run:
-                level = np.float64(r * share + g * share + b * share)
-                changed += (area[cell] * (level - _level(direct, cell))) ** 2
-                n_whole += 1
             direct[cell, 0], direct[cell, 1], direct[cell, 2] = r * share, g * share, b * share
-        change[i] = changed if n_whole > 0 else np.inf
