@@ -72,7 +72,7 @@ def shot_keys(snapshot: SceneSnapshot, quality: Quality, engine: str) -> ShotKey
     # Records stand where light that bounces would show them.
     rows = gather if quality.record_error is None else training
     transport = digest("transport", rows, *_transport_settings(quality))
-    packed = digest("packed", transport, training, quality.packing_error)
+    packed = digest("packed", transport, training, quality.packing_error, quality.packing_spare)
     cell_light = digest("cell light", bounces, lights, quality.n_bounces, quality.light_samples, quality.dome_places)
     view_light = digest("view light", sight, lights, quality.light_samples, quality.dome_samples)
     view = digest("view", sight, domes)  # the sky behind the scene is part of the view
@@ -96,7 +96,7 @@ def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     elsewhere |= {"light_samples", "dome_samples", "dome_places", "samples_per_pixel"}
     at_records, everywhere = {"record_rays", "record_share"}, {"rays_per_row", "row_spacing", "shared_rays"}
     unused = at_records if quality.record_error is None else everywhere
-    without = elsewhere | unused | {"packing_error"}
+    without = elsewhere | unused | {"packing_error", "packing_spare"}
     return tuple((name, value) for name, value in asdict(quality).items() if name not in without)
 
 

@@ -169,7 +169,8 @@ class ShotParts:
             raise ValueError("this quality asks for exact rows; give it a packing_error")
 
         def make(_: Shelf | None) -> PackedTransport:
-            packed = pack(self.transport, self.gather, self.training, error, progress=self.progress)
+            rows, training, spare = self.transport, self.training, self.quality.packing_spare
+            packed = pack(rows, self.gather, training, error, spare=spare, progress=self.progress)
             # The exact rows have a shelf of their own.
             return replace(packed, source=None)
 

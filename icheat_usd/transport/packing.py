@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ _TRIALS = 6
 _FIRST_ROOM = 16384  # coefficients of a tile
 _FIRST_LEAST = 0.1  # worth of a coefficient to begin the search with, of a tile's tolerated squared error
 _CLOSE_ENOUGH = 1.08  # ratio of errors at which the search for the amount ends
+_FINEST = 0.7  # of the tolerated error: it is not worth bytes to go below, however few these are
 _PRIOR = 0.2  # share of the energy that is taken from a coefficient's surroundings: the training lights are few
 _PRIOR_LEVELS = 4  # of ancestors that these surroundings reach up
 _ANYWHERE = 0.1  # share of those that is the same everywhere: no place stays dark for ever
@@ -49,6 +51,15 @@ class _Tile(NamedTuple):
     scale: F32
     worth: F32
     value: NDArray[np.int8]
+
+
+class _Trial(NamedTuple):
+    """What some tiles lose with one least worth of a coefficient."""
+
+    worth: float  #: its logarithm
+    off: float  #: error of the lights, of the tolerated one
+    n_kept: float  #: coefficients of 64 records, on average
+    errors: F64  #: (n_lights,)
 
 
 class _Room(threading.local):
@@ -109,6 +120,7 @@ def pack(
     training: F32,
     tolerance: float = 0.015,
     *,
+    spare: int = 0,
     progress: Progress = silent,
 ) -> PackedTransport:
     """Keep of each tile of rows the coefficients that matter to plausible lights, in 8 bits.
@@ -116,7 +128,8 @@ def pack(
     A coefficient's worth is the squared response it adds at the tile's records
     under the mean training light, in the pixels that use them. One least worth
     for all tiles and lobes is found such that lights that the tiles were not chosen by
-    are off by `tolerance`: half of the training lights, for tiles packed by the other half.
+    are off by `tolerance`: half of the training lights, for tiles packed by the other half. Where few
+    coefficients do that, more are kept: rows that are read in no time need not lose as much.
 
     Parameters
     ----------
@@ -126,6 +139,8 @@ def pack(
         Radiance that plausible lights make leave the cells.
     tolerance
         Relative RMS error at the records, median over such lights, but for those that the view hardly sees.
+    spare
+        Coefficients of 64 records, on average, that are kept in any case, until the error is 0.7 of the tolerated one.
 
     Raises
     ------
@@ -136,7 +151,7 @@ def pack(
     -----
     Bitwise the same for any number of threads.
     """
-    return pack_on_tree(transport, gather.tree, training, tolerance, progress=progress)
+    return pack_on_tree(transport, gather.tree, training, tolerance, spare=spare, progress=progress)
 
 
 def pack_on_tree(
@@ -145,6 +160,7 @@ def pack_on_tree(
     training: F32,
     tolerance: float,
     *,
+    spare: int = 0,
     progress: Progress = silent,
 ) -> PackedTransport:
     """`pack` for whoever has no more of the gather samples than their tree."""
@@ -158,7 +174,7 @@ def pack_on_tree(
     weighted = [_weigh(lobe, transport.interpolation, training) for lobe in transport.lobes]
     weighted, light, response = _normalise(tree, training, weighted)
     packer = _Packer(tree)
-    least, light_error = _find_least(packer, weighted, light, response, tolerance, progress)
+    least, light_error = _find_least(packer, weighted, light, response, tolerance, spare, progress)
     lobes = []
     n_tiles = sum(_n_tiles(part.rows) for part in weighted if part.rows.n_entries)
     done = 0
@@ -238,12 +254,15 @@ def _find_least(
     light: kernels.Light,
     response: F64,
     tolerance: float,
+    spare: int,
     progress: Progress,
 ) -> tuple[float, F64]:
     """Least worth of a coefficient, and the errors that it makes of the lights that the view sees.
 
     Found by trials on some of the tiles, packed by one half of the lights and
     measured with the other, and the other way round. Where all lights are dim, all that the view sees at all count.
+    Where the error is `tolerance` with less than `spare` coefficients of 64 records, the search goes on to these or to
+    `_FINEST` of `tolerance`, whichever comes first.
     """
     parts = [(part, _some_tiles(_n_tiles(part.rows))) for part in weighted if part.rows.n_entries]
     n_lights = light.coefficients.shape[1]
@@ -254,25 +273,43 @@ def _find_least(
         return float(np.finfo(np.float32).tiny), np.zeros(0)
     halves = [np.arange(side, n_lights, 2) for side in (0, 1)]
     of_half = [_light(packer.tree, np.ascontiguousarray(light.coefficients[:, half])) for half in halves]
-    least = tolerance**2 * _FIRST_LEAST / sum(_n_tiles(part.rows) for part, _ in parts)
-    tried: list[tuple[float, float, F64]] = []  # logarithms of a worth and of error / tolerance, and errors
-    for trial in range(_TRIALS):
-        squared = np.zeros(n_lights)
+    n_tiles = max(_n_tiles(part.rows) for part, _ in parts)
+
+    def tried(least: float) -> _Trial:
+        squared, n_kept = np.zeros(n_lights), 0.0
         for part, tiles in parts:
             share = _n_tiles(part.rows) / len(tiles)
             for known, trained, others in zip(of_half, halves, reversed(halves), strict=True):
-                error = _try(packer, part, light, known, trained, others, tiles, least)
+                error, n = _try(packer, part, light, known, trained, others, tiles, least)
                 squared[others] += share * error
+                n_kept += share * n / len(halves)
         errors = np.sqrt(squared[shown]) / response[shown]
-        ratio = max(PackingReport(errors).error / tolerance, 1e-12)
-        tried.append((float(np.log(least)), float(np.log(ratio)), errors))
-        progress("choose coefficients", (trial + 1) / _TRIALS)
-        if 1 / _CLOSE_ENOUGH < ratio < _CLOSE_ENOUGH:
+        return _Trial(float(np.log(least)), PackingReport(errors).error / tolerance, n_kept / n_tiles, errors)
+
+    least = tolerance**2 * _FIRST_LEAST / sum(_n_tiles(part.rows) for part, _ in parts)
+    found = [tried(least)]
+    best = _search(tried, found, lambda one: one.off, progress)
+    if best.n_kept < spare:
+        # Either falls as more is kept.
+        best = _search(tried, found, lambda one: min(one.off / _FINEST, spare / max(one.n_kept, 1.0)), progress)
+    return float(np.exp(best.worth)), best.errors
+
+
+def _search(
+    tried: Callable[[float], _Trial], found: list[_Trial], ratio: Callable[[_Trial], float], progress: Progress
+) -> _Trial:
+    """The least that is kept with a ratio of about 1, from what was found before and a few trials that join it."""
+
+    def points() -> list[tuple[float, float]]:
+        return [(one.worth, float(np.log(max(ratio(one), 1e-12)))) for one in found]
+
+    for trial in range(1, _TRIALS):
+        progress("choose coefficients", trial / _TRIALS)
+        if any(abs(off) < np.log(_CLOSE_ENOUGH) for _, off in points()):
             break
-        least = float(np.exp(_next_trial([(worth, off) for worth, off, _ in tried])))
-    fitting = [one for one in tried if one[1] < np.log(_CLOSE_ENOUGH)]
-    worth, _, errors = max(fitting or [min(tried, key=lambda one: one[0])], key=lambda one: one[0])
-    return float(np.exp(worth)), errors
+        found.append(tried(float(np.exp(_next_trial(points())))))
+    fitting = [one for one, (_, off) in zip(found, points(), strict=True) if off < np.log(_CLOSE_ENOUGH)]
+    return max(fitting, key=lambda one: one.worth) if fitting else min(found, key=lambda one: one.worth)
 
 
 def _try(
@@ -284,19 +321,20 @@ def _try(
     others: I64,
     tiles: I64,
     least: float,
-) -> F64:
-    """Squared errors of the lights `others` in some tiles packed by the lights `trained`."""
+) -> tuple[F64, int]:
+    """Squared errors of the lights `others` in some tiles packed by the lights `trained`, and what these keep."""
     of_half = part._replace(response=np.ascontiguousarray(part.response[:, trained]))
     unknown = np.ascontiguousarray(light.coefficients[:, others])
 
-    def of_few(few: I64) -> F64:
+    def of_few(few: I64) -> tuple[F64, int]:
         packed = _join(packer.tree, len(few) * LANES, packer.pack(of_half, known, few, least))
         exact = _part_of_tiles(part, few)
         product = packed.multiply(unknown)[: len(exact.row_weight)]
         error: F64 = np.square(exact.row_weight) @ np.square((product - exact.response[:, others]).astype(np.float64))
-        return error
+        return error, len(packed.index)
 
-    return sum(overlapping([partial(of_few, few) for few in _few_at_once(tiles)]), np.zeros(len(others)))
+    found = list(overlapping([partial(of_few, few) for few in _few_at_once(tiles)]))
+    return sum((error for error, _ in found), np.zeros(len(others))), sum(n for _, n in found)
 
 
 def _few_at_once(tiles: I64) -> list[I64]:
