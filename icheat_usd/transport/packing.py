@@ -303,8 +303,8 @@ def _search(
     def points() -> list[tuple[float, float]]:
         return [(one.worth, float(np.log(max(ratio(one), 1e-12)))) for one in found]
 
-    for trial in range(1, _TRIALS):
-        progress("choose coefficients", trial / _TRIALS)
+    for _ in range(1, _TRIALS):
+        progress("choose coefficients", len(found) / (2 * _TRIALS))  # two searches at most
         if any(abs(off) < np.log(_CLOSE_ENOUGH) for _, off in points()):
             break
         found.append(tried(float(np.exp(_next_trial(points())))))

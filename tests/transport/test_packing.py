@@ -111,22 +111,22 @@ def test_what_is_spare_is_kept_until_the_error_is_a_third_less(scene: tuple[Clus
     tree, position, transport = scene
     training = lights(position, 24, 2)
 
-    def packed(tolerance: float, spare: int) -> PackedTransport:
-        return pack_on_tree(transport, tree, training, tolerance, spare=spare)
+    def packed(spare: int) -> PackedTransport:
+        return pack_on_tree(transport, tree, training, 0.003, spare=spare)
 
     def n_kept(found: PackedTransport) -> float:
         rows = found.lobes[0].rows
         return len(rows.index) / rows.n_tiles
 
-    plain, finest = packed(0.003, 0), packed(0.003, 10 * tree.n_leaves)
+    plain, finest = packed(0), packed(10 * tree.n_leaves)
     assert plain.report is not None and finest.report is not None
     assert finest.report.error == pytest.approx(0.7 * 0.003, rel=0.2)
     assert n_kept(finest) > 1.1 * n_kept(plain)
     # Where so many are kept anyway, it makes no difference.
-    same = packed(0.003, int(0.5 * n_kept(plain))).lobes[0].rows
+    same = packed(int(0.5 * n_kept(plain))).lobes[0].rows
     for name in ("tile_begin", "index", "scale", "value"):
         np.testing.assert_array_equal(getattr(same, name), getattr(plain.lobes[0].rows, name))
-    between = packed(0.003, int((n_kept(plain) + n_kept(finest)) / 2))
+    between = packed(int((n_kept(plain) + n_kept(finest)) / 2))
     assert n_kept(plain) < n_kept(between) < n_kept(finest)
 
 
