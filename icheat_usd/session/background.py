@@ -19,8 +19,8 @@ Job = Callable[[], None]
 #: Longest that a piece of work is put off for commands.
 _PATIENCE_SECONDS = 0.5
 
-#: From one `tidy` to the next.
-_TIDY_SECONDS = 60.0
+#: From one `tidy` to the next: with a minute, memory followed how many commands went through in it.
+_TIDY_SECONDS = 10.0
 
 
 class Stopped(BaseException):
