@@ -12,6 +12,9 @@ from matplotlib import pyplot, ticker  # noqa: E402
 
 from tools.benchmarking.growth import points_of  # noqa: E402
 
+#: What a plot of growth shows: its names in the report.
+_GROWING = {"frame of a light's colour": "frame_seconds", "build": "transport_seconds", "peak memory": "peak_mib"}
+
 
 def plot(report: dict[str, Any], folder: Path) -> list[Path]:
     """One image per suite that has something to show."""
@@ -60,11 +63,12 @@ def _growth(results: list[dict[str, Any]], path: Path) -> bool:
     for axes, kind in zip(all_axes[0], kinds, strict=True):
         some = [point for point in points if point["what"] == kind]
         sizes = [point["size"] for point in some]
-        for name, key in (("frame", "frame_seconds"), ("build", "transport_seconds"), ("memory", "peak_mib")):
+        # A panel without a build has the same colours.
+        for k, (name, key) in enumerate(_GROWING.items()):
             values = [point[key] for point in some if key in point]
             if len(values) < len(sizes):
                 continue
-            axes.plot(sizes, [value / values[0] for value in values], "o-", label=name)
+            axes.plot(sizes, [value / values[0] for value in values], "o-", color=f"C{k}", label=name)
         axes.set_title(kind, fontsize=9)
         axes.set_ylim(bottom=0)
         # 1,000,000 beside 1,050,000 would be one black bar.
