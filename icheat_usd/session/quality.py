@@ -47,7 +47,7 @@ RECORDS = replace(PREVIEW, record_error=0.01, rays_per_bounce_row=256)
 
 #: The same, packed so that a frame takes milliseconds. Lights that an artist sets lose a third to all of what plausible
 #: lights lose, among which are beams on few cells; what is lost beyond this is noise of the rows. Where few
-#: coefficients do for that, a product takes a millisecond or less, and two or three times as many are worth their time.
+#: coefficients do for that, a product takes a millisecond or two, and more of them are worth their time.
 LIVE = replace(RECORDS, rest_bounce_rays=1024, packing_error=0.0275, packing_spare=2400)
 
 #: For a close look at what lives on.
