@@ -10,7 +10,7 @@ from icheat_usd.transport import PackedTransport, Transport, build_transport, lo
 from icheat_usd.transport.packed import PackedLobe, PackedRows
 from tests.pipeline import Pipeline
 from tests.scenes import cornell
-from tools.benchmarking.converged import converged_products, lossy_errors
+from tools.benchmarking.converged import Probe, converged_products, lossy_errors, samples_of_noisy_pixels
 
 N_RAYS = 4096
 
@@ -86,3 +86,16 @@ def test_terms_left_out_are_lost_and_noise_of_the_rows_is_not(parts: Pipeline, l
     expected = (products[:2] - products[2:])[:, at]
     difference = with_packing[0][:, at] - expected
     assert np.sqrt(np.mean(difference**2)) < 0.1 * np.sqrt(np.mean(expected**2))
+
+
+def test_noisy_pixels_are_those_with_most_noise_under_any_light() -> None:
+    rng = np.random.default_rng(3)
+    owner = np.repeat(np.arange(40), 2)
+    probe = Probe(np.arange(40), np.arange(80), owner, np.full((80, 3), 0.5, np.float32), 40, (1, 40), 1)
+    error = rng.random((2, 80, 3), np.float32)  # which is not noise, however large
+    halves = np.stack([error, error])
+    halves[1] += 1e-3 * rng.random((2, 80, 3), np.float32)
+    halves[1, 0, 6] += 5  # one sample of pixel 3, under the first light
+    halves[1, 1, 63] += 0.1  # and one of pixel 31 under the second, which is less bright
+    noisy = samples_of_noisy_pixels(probe, (np.stack([error, error]), halves), 2)
+    np.testing.assert_array_equal(noisy, [6, 7, 62, 63])

@@ -219,6 +219,24 @@ def lossy_errors(
     return interpolated, with_packing
 
 
+def samples_of_noisy_pixels(probe: Probe, losses: tuple[F32, F32], n: int) -> I64:
+    """Positions in the probe's samples of the `n` pixels whose noise is the largest share of any light's.
+
+    Parameters
+    ----------
+    losses
+        Of `lossy_errors`, for the samples of the probe.
+    """
+    share = np.zeros(len(probe.pixel))
+    for off in losses:
+        for one, two in off.transpose(1, 0, 2, 3):
+            noise = np.square(probe.to_pixels(one - two)).sum(axis=1)
+            share = np.maximum(share, noise / max(float(noise.sum()), 1e-30))
+    chosen = np.zeros(len(share), bool)
+    chosen[np.argsort(-share, kind="stable")[:n]] = True
+    return np.flatnonzero(chosen[probe.owner])
+
+
 class _KeptTerms:
     """Products of other rows in the terms that a lobe keeps of its own."""
 

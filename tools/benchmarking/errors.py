@@ -26,6 +26,7 @@ from tools.benchmarking.converged import (
     converged_products,
     converged_transport,
     lossy_errors,
+    samples_of_noisy_pixels,
     view_of,
 )
 from tools.benchmarking.error_images import write_error_image, write_sheet, write_signed_image
@@ -44,6 +45,8 @@ class ErrorSettings:
     rays: int = 16_384  #: per pixel and lobe, each of two halves
     record_pixels: int = 2000  #: of these pixels, for the part of interpolation
     record_rays: int = 2048  #: per pixel and record, each of two halves
+    noisy_pixels: int = 100  #: of these, that are measured again, as their noise is most of all pixels'
+    noisy_rays: int = 32_768  #: with which that is done
     edit_pixels: int = 500
     hit_pixels: int = 200  #: for the comparison with light at true hits
     hit_rays: int = 1024
@@ -163,6 +166,12 @@ def _lossy(
     own, seeds = parts.lights.radiance, (settings.seed + 3000, settings.seed + 4000)
     scene = parts.snapshot, parts.tracer, parts.gather, parts.view
     losses = lossy_errors(*scene, parts.packed, probe.samples, settings.record_rays, seeds, own)
+    # Of rays that did not choose the pixels: what is measured stays without bias.
+    noisy = samples_of_noisy_pixels(probe, losses, settings.noisy_pixels)
+    seeds = settings.seed + 5000, settings.seed + 6000
+    again = lossy_errors(*scene, parts.packed, probe.samples[noisy], settings.noisy_rays, seeds, own)
+    for off, better in zip(losses, again, strict=True):
+        off[:, :, noisy] = better
     for light, name in enumerate(names):
         a, b = references.same_b[0][light][kept], references.same_b[1][light][kept]
         found = {}
