@@ -14,7 +14,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.packed import PARTS, PairedTiles, share
+from icheat_usd.kernels.packed import PARTS, share
+from icheat_usd.kernels.paired_tiles import PairedTiles
 from icheat_usd.kernels.simd import address_of, fetch
 from icheat_usd.kernels.tile_product import QUANTA, multiply_tile, new_room, tables_of
 

@@ -1,15 +1,9 @@
-"""Products of quantised transport tiles with the light of gather cells.
-
-How `tile_product` wants them, which multiplies integers; and the plain product, `multiply_tiles`, with float32 sums.
-"""
+"""Products of quantised transport tiles with the light of gather cells, with float32 sums."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import prange
-from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.simd import (
@@ -27,43 +21,6 @@ from icheat_usd.kernels.simd import (
 
 LANES = 64  # rows of a tile: four vectors of sums for each of three channels stay in registers
 PARTS = 32  #: runs of equal work: threads take equal shares of the parts, one behind the other
-
-
-class PairedTiles(NamedTuple):
-    """Quantised tiles as `multiply_tile` reads them: quanta of every two successive coefficients side by side."""
-
-    tile_begin: NDArray[np.int64]  #: (n_tiles + 1,) even numbers
-    index: NDArray[np.int32]  #: (n,)
-    scale: NDArray[np.float32]  #: (n,) 0 where a tile was filled up
-    worth: NDArray[np.float32]  #: (n,) what a coefficient counts, 0 where a tile was filled up
-    value: NDArray[np.int8]  #: (n / 2, 64, 2)
-
-
-def pair_coefficients(
-    tile_begin: NDArray[np.int64],
-    index: NDArray[np.int32],
-    scale: NDArray[np.float32],
-    worth: NDArray[np.float32],
-    value: NDArray[np.int8],
-) -> PairedTiles:
-    """Put the quanta (n, 64) of every two successive coefficients of a tile side by side."""
-    counts = np.diff(tile_begin)
-    begin = np.concatenate([[0], np.cumsum(counts + counts % 2)]).astype(np.int64)
-    place = np.arange(len(index)) + np.repeat(begin[:-1] - tile_begin[:-1], counts)
-    n = int(begin[-1])
-    paired_index, (paired_scale, paired_worth) = np.zeros(n, np.int32), np.zeros((2, n), np.float32)
-    quanta = np.zeros((n // 2, LANES, 2), np.int8)
-    paired_index[place], paired_scale[place], paired_worth[place] = index, scale, worth
-    quanta[place // 2, :, place % 2] = value
-    return PairedTiles(begin, paired_index, paired_scale, paired_worth, quanta)
-
-
-def join_tiles(parts: list[PairedTiles]) -> PairedTiles:
-    """Tiles of several lobes as tiles of one, those of the first lobe first."""
-    ends = np.cumsum([0, *(part.tile_begin[-1] for part in parts)])
-    begin = [part.tile_begin[:-1] + first for part, first in zip(parts, ends[:-1], strict=True)]
-    joined = [np.concatenate(arrays) for arrays in list(zip(*parts, strict=True))[1:]]
-    return PairedTiles(np.concatenate([*begin, ends[-1:]]).astype(np.int64), *joined)
 
 
 @kernel

@@ -56,7 +56,7 @@ _WORD_STEPS = 1.0 / 32767.0
 class Tables(NamedTuple):
     """Addresses of what products are made of, and where they go."""
 
-    index: int  #: of the columns of `packed.PairedTiles`
+    index: int  #: of the columns of `paired_tiles.PairedTiles`
     scale: int
     value: int
     light: int  #: of (n_versions, m, 4) float32 coefficients

@@ -12,7 +12,7 @@ from icheat_usd.kernels import version_products as kernels
 from icheat_usd.kernels.found_terms import TermColumns, find_of_jobs, multiply_found, order_terms
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.marked_terms import WORD, mark_terms, multiply_marked
-from icheat_usd.kernels.packed import PairedTiles, join_tiles, pair_coefficients
+from icheat_usd.kernels.paired_tiles import PairedTiles, QuantisedTiles, pair_tiles
 from icheat_usd.kernels.residuals import largest_channels, squares_of_tiles
 from icheat_usd.kernels.term_energy import least_of_versions
 from icheat_usd.kernels.workers import take_back
@@ -78,13 +78,9 @@ class _Tiles:
     """Packed rows of all lobes as kernels read them."""
 
     def __init__(self, rows: list[PackedRows], narrow_of: _Tiles | None = None) -> None:
-        parts = [
-            pair_coefficients(of_lobe.tile_begin, of_lobe.index, of_lobe.scale, of_lobe.worth, of_lobe.value)  # type: ignore[arg-type]
-            for of_lobe in rows
-        ]
         self.n_tiles = rows[0].n_tiles
         self.n_lobes = len(rows)
-        self._tiles: PairedTiles = join_tiles(parts)
+        self._tiles: PairedTiles = pair_tiles([_quantised(of_lobe) for of_lobe in rows])
         # Also of what is narrower, so that nothing that was there before stays.
         self._is_empty: Bool = np.diff(self._tiles.tile_begin) == 0 if narrow_of is None else narrow_of._is_empty
         self._columns: TermColumns | None = None
@@ -469,6 +465,11 @@ class Products:
             kernels.multiply_pairs(rows.tile_begin, rows.index, rows.scale, rows.value, versions, tile, version, out)
         else:
             kernels.multiply_sparse_pairs(rows.indptr, rows.indices, rows.weights, versions, tile, version, out)
+
+
+def _quantised(rows: PackedRows) -> QuantisedTiles:
+    assert rows.value.dtype == np.int8
+    return QuantisedTiles(rows.tile_begin, rows.index, rows.scale, rows.worth, rows.value)  # type: ignore[arg-type]
 
 
 def _n_entries(rows: Any) -> int:

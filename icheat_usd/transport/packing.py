@@ -387,9 +387,12 @@ def _sparse_tiles(part: _Weighted) -> kernels.SparseTiles:
 
 
 def _join(tree: ClusterTree, n_rows: int, tiles: list[_Tile]) -> PackedRows:
+    """Rows of tiles, which leave the list one by one: all of them together take as much memory as the rows."""
     none = _Tile(np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32), np.empty((0, LANES), np.int8))
-    tiles = tiles or [none] * -(-n_rows // LANES)
-    begin = _begin(np.array([len(tile.coefficient) for tile in tiles], np.int64))
-    # with an empty one, since a camera that sees no surface has no tiles
-    index, scale, worth, value = (np.concatenate([none[k], *(tile[k] for tile in tiles)]) for k in range(4))
+    counts = [len(tile.coefficient) for tile in tiles] or [0] * -(-n_rows // LANES)
+    begin = _begin(np.array(counts, np.int64))
+    index, scale, worth, value = _Tile(*(np.empty((begin[-1], *part.shape[1:]), part.dtype) for part in none))
+    while tiles:
+        last = slice(begin[len(tiles) - 1], begin[len(tiles)])
+        index[last], scale[last], worth[last], value[last] = tiles.pop()
     return PackedRows(tree, n_rows, begin, index, scale, worth, value)

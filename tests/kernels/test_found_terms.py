@@ -11,7 +11,7 @@ import pytest
 from icheat_usd.kernels.found_terms import find_of_jobs, multiply_found, order_terms
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.marked_terms import WORD, mark_terms, multiply_marked
-from icheat_usd.kernels.packed import PairedTiles, pair_coefficients
+from icheat_usd.kernels.paired_tiles import PairedTiles, QuantisedTiles, pair_tiles
 
 N_COEFFICIENTS, N_VERSIONS = 400, 5
 
@@ -25,7 +25,7 @@ def some_tiles() -> PairedTiles:
     scale = (rng.random(begin[-1]) ** 6).astype(np.float32)
     value = rng.integers(-127, 128, (begin[-1], 64)).astype(np.int8)
     worth = (scale * rng.uniform(0.5, 1, len(scale))).astype(np.float32)
-    return pair_coefficients(begin, index.astype(np.int32), scale, worth, value)
+    return pair_tiles([QuantisedTiles(begin, index.astype(np.int32), scale, worth, value)])
 
 
 def some_light() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

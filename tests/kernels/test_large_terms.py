@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from icheat_usd.kernels.large_terms import multiply_terms
-from icheat_usd.kernels.packed import join_tiles, multiply_tiles, pair_coefficients
+from icheat_usd.kernels.packed import multiply_tiles
+from icheat_usd.kernels.paired_tiles import QuantisedTiles, pair_tiles
 
 N_COEFFICIENTS = 300
 
@@ -49,7 +50,7 @@ def test_the_product_is_that_of_the_large_terms(least: float) -> None:
     expected, found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
     leasts = np.full(2, least, np.float32)
     multiply_terms(
-        *pair_coefficients(begin, index, scale, worth, value),
+        *pair_tiles([QuantisedTiles(begin, index, scale, worth, value)]),
         light,
         size,
         leasts,
@@ -86,7 +87,7 @@ def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
     begin, index, scale, worth, value = some_tiles()
     light = some_light()
     size, least = np.abs(light).max(axis=2), np.full(2, 0.01, np.float32)
-    paired = pair_coefficients(begin, index, scale, worth, value)
+    paired = pair_tiles([QuantisedTiles(begin, index, scale, worth, value)])
     found = np.zeros((2, len(PAIR_TILE), 64, 4), np.float32)
     for threads, out in zip((1, 2), found, strict=True):
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
@@ -98,13 +99,16 @@ def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
 def test_tiles_of_two_lobes_are_those_of_each() -> None:
     begin, index, scale, worth, value = some_tiles()
     light = some_light()
-    one = pair_coefficients(begin, index, scale, worth, value)
-    other = pair_coefficients(begin, index[::-1].copy(), 2 * scale, worth, value)
+    lobes = [
+        QuantisedTiles(begin, index, scale, worth, value),
+        QuantisedTiles(begin, index[::-1].copy(), 2 * scale, worth, value),
+    ]
+    one, other = (pair_tiles([lobe]) for lobe in lobes)
     none, n = np.zeros((1, 0), np.float32), len(PAIR_TILE)
     joined, apart = np.zeros((2, 2 * n, 64, 4), np.float32)
     tile, version = np.concatenate([PAIR_TILE, PAIR_TILE + 4]), np.tile(PAIR_VERSION, 2)
     place = np.arange(2 * n, dtype=np.int32)
-    multiply_terms(*join_tiles([one, other]), light, none, none[0], tile, version, place, joined)
+    multiply_terms(*pair_tiles(lobes), light, none, none[0], tile, version, place, joined)
     for part, tiles in ((apart[:n], one), (apart[n:], other)):
         multiply_terms(*tiles, light, none, none[0], PAIR_TILE, PAIR_VERSION, PLACE, part)
     assert apart[n:].any()

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from icheat_usd.kernels.large_terms import multiply_terms
-from icheat_usd.kernels.packed import LANES, multiply_tiles, pair_coefficients
+from icheat_usd.kernels.packed import LANES, multiply_tiles
+from icheat_usd.kernels.paired_tiles import QuantisedTiles, pair_tiles
 from icheat_usd.scene import F32, F64, I32, I64
 
 
@@ -34,7 +35,7 @@ def product(tiles: Tiles, coefficients: F32, pair_tile: I32, pair_version: I32, 
     out = np.full((len(pair_tile), LANES, 4), np.nan, np.float32)
     if integers:
         begin, index, scale, value = tiles
-        paired = pair_coefficients(begin, index, scale, scale, value)
+        paired = pair_tiles([QuantisedTiles(begin, index, scale, scale, value)])
         none, place = np.zeros((1, 0), np.float32), np.arange(len(out), dtype=np.int32)
         multiply_terms(*paired, coefficients, none, none[0], pair_tile, pair_version, place, out)
     else:

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from icheat_usd.kernels.assemble import assemble_film, chunks_in_order, sum_scaled
 from icheat_usd.kernels.film_table import film_table
 from icheat_usd.kernels.large_terms import multiply_terms
-from icheat_usd.kernels.packed import LANES, PairedTiles, multiply_tiles, pair_coefficients
+from icheat_usd.kernels.packed import LANES, multiply_tiles
+from icheat_usd.kernels.paired_tiles import PairedTiles, QuantisedTiles, pair_tiles
 from icheat_usd.kernels.simd import address_of, load, multiply_add, spread, store, zeros
 from icheat_usd.samples import ViewSamples
 from icheat_usd.samples.wavelets import haar_of_versions, plan_haar
@@ -150,7 +151,7 @@ def _products(packed: PackedTransport, b: F32) -> list[_Product]:
         if len(rows.index) and rows.value.dtype == np.int8:
             n = len(rows.tile_begin) - 1
             quanta = np.asarray(rows.value, np.int8)
-            paired = pair_coefficients(rows.tile_begin, rows.index, rows.scale, rows.worth, quanta)
+            paired = pair_tiles([QuantisedTiles(rows.tile_begin, rows.index, rows.scale, rows.worth, quanta)])
             coefficients = haar_of_versions(plan_haar(rows.tree), b[None])
             tile = np.arange(n, dtype=np.int32)
             products.append(

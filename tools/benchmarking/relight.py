@@ -26,6 +26,8 @@ _QUICK_STAGE = "sample_stages/cornell_box/shot.usda"
 
 #: Sets of `test_lights`, named here too so that `--help` needs nothing else.
 _LIGHT_SETS = ("first", "second")
+#: Names of qualities of `icheat_usd.session`, for the same reason.
+_QUALITIES = ("LIVE", "LIVE_FINE")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mixed", action="store_true", help="frames: also 64 edits of which some turn hues; takes minutes"
     )
     parser.add_argument("--gather", type=int, help="gather samples; default the preview's own")
+    parser.add_argument("--quality", choices=_QUALITIES, help="of the preview; default LIVE, for errors both")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -49,5 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     effort = {"width": arguments.width, "height": arguments.height, "n_gather": arguments.gather}
     if arguments.quick:
         effort = {"width": 32, "height": 24, "n_gather": 512}
+    if arguments.quality or arguments.quick:
+        effort["quality"] = arguments.quality or _QUALITIES[0]
     options = {"minutes": arguments.minutes, "lights": arguments.lights, "mixed": arguments.mixed}
     return run_benchmark(BENCHMARK, arguments, stages, effort, options)

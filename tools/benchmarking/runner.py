@@ -82,7 +82,9 @@ def run_benchmark(
     for name in chosen:
         suite = _module(benchmark, name)
         results: list[dict[str, Any]] = []
-        for case in suite.cases(stages, arguments.quick):
+        wanted = effort.get("quality")
+        cases = suite.cases(stages, arguments.quick)
+        for case in [case for case in cases if wanted is None or case.get("quality", wanted) == wanted]:
             case = {"name": short_name(case["stage"]), **options, **case}
             print(f"{name}: {_described(case, options)}", flush=True)
             task = {"suite": name, "case": case, "effort": effort, "quick": arguments.quick}
