@@ -72,6 +72,8 @@ class LiveRelighter:
         Exact rows need no packing, and are slower.
     held_back : HeldBack, optional
         Needed by edits that let light pass occluders.
+    moving_detail
+        Of light not seen before, errors of terms that are not read are divided by this; frames take longer.
     """
 
     def __init__(
@@ -83,7 +85,9 @@ class LiveRelighter:
         lights: Lights,
         *,
         held_back: HeldBack | None = None,
+        moving_detail: float = 1.0,
     ) -> None:
+        self._moving_detail = moving_detail
         self.view, self.gather, self.lights, self.held_back = view, gather, lights, held_back
         self._snapshot = snapshot
         self._albedo = np.ascontiguousarray(view.points.albedo)
@@ -116,7 +120,7 @@ class LiveRelighter:
         self.transport = transport
         self._films.forget()
         self._amounts.forget()
-        self._products = Products(transport, self.gather.tree)
+        self._products = Products(transport, self.gather.tree, detail=self._moving_detail)
         self._table = _table(self._products)
         self._pair_products = None if exact is None else PairProducts(exact, self.view, self.gather)
         self._exact_products: Products | None = None

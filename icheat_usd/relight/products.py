@@ -168,8 +168,15 @@ class Products:
     """One transport, and what each version of the light is in the basis of its rows."""
 
     def __init__(
-        self, transport: Transport | PackedTransport, tree: ClusterTree, names: tuple[str, ...] | None = None
+        self,
+        transport: Transport | PackedTransport,
+        tree: ClusterTree,
+        names: tuple[str, ...] | None = None,
+        detail: float = 1.0,
     ) -> None:
+        # By which `LEFT_OUT` and its like are divided; and as errors fall with more bytes, so are these more.
+        self._detail = detail
+        self._most_bytes = int(MOVING_BYTES * detail**2)
         # A lobe that no view sample has holds no rows and costs nothing.
         lobes: list[Any] = [
             lobe for lobe in transport.lobes if (_n_entries(lobe.rows) if names is None else lobe.name in names)
@@ -182,7 +189,8 @@ class Products:
             isinstance(rows, PackedRows) and rows.value.dtype == np.int8 for rows in self._rows
         )
         self._tiles = _Tiles(self._rows) if is_quantised else None
-        self._narrow: _Tiles | None = None
+        self._is_narrow = False
+        self._narrow: _Tiles | None = None  # of quantised rows alone; others are not large
         self._n_leaves = tree.n_leaves
         self._tree = tree
         n_view = len(transport.lobes[0].tint)
@@ -219,12 +227,15 @@ class Products:
 
     @property
     def is_narrow(self) -> bool:
-        """Whether there are narrowed rows beside the others."""
-        return self._narrow is not None
+        """Whether it was narrowed."""
+        return self._is_narrow
 
     def narrow(self, lights: F32, n_versions: int, max_bytes: int) -> None:
         """Keep, beside the rows, what of them matters to lights (n_lights, n_leaves, 3) and the first versions."""
         assert self._packed is not None
+        self._is_narrow = True
+        if self._tiles is None:
+            return
         sizes = np.abs(self._versions[:n_versions]).max(axis=(0, 2), initial=0.0)
         for light in lights:
             np.maximum(sizes, np.abs(haar_of_versions(self._plan, light[None])).max(axis=(0, 2)), out=sizes)
@@ -232,7 +243,7 @@ class Products:
 
     def widen(self) -> None:
         """Forget the narrowed rows."""
-        self._narrow = None
+        self._narrow, self._is_narrow = None, False
 
     def clear(self, version: int | None = None) -> None:
         """Forget one version, or all."""
@@ -343,13 +354,14 @@ class Products:
     def _find_least(self, versions: I64, part: F64, least: F32) -> None:
         """Least terms of some versions that count; of those with many cells a sample of all terms tells."""
         assert self._few_terms is not None and self._energy is not None
-        error = LEFT_OUT_OF_VERSION**2 * self._shown
+        error = (LEFT_OUT_OF_VERSION / self._detail) ** 2 * self._shown
         # Of a small part, a larger share is as much of the whole version.
-        share = np.minimum(LEFT_OUT_OF_ITSELF**2 / np.maximum(part, np.finfo(np.float64).tiny), 1.0)
+        of_itself = (LEFT_OUT_OF_ITSELF / self._detail) ** 2
+        share = np.minimum(of_itself / np.maximum(part, np.finfo(np.float64).tiny), 1.0)
         is_large = self._is_large[versions]
         for v in versions[is_large]:
-            of_itself = self._few_terms.least_of_error(self._sizes[v], error, MOVING_BYTES, float(share[v]))
-            least[v] = max(of_itself, least[v])
+            least_of_v = self._few_terms.least_of_error(self._sizes[v], error, self._most_bytes, float(share[v]))
+            least[v] = max(least_of_v, least[v])
         least_of_versions(versions[~is_large].astype(np.int64), self._sizes, *self._energy, error, share, least)
 
     def multiply_cells(self, cells: I32, values: F32, tile: I32, out: F32) -> None:
@@ -432,7 +444,8 @@ class Products:
         self.see(looked_at, some)
         if seen is not None:
             seen()
-        least = self._large_terms.least_of_error(size[0], LEFT_OUT**2 * self._shown, MOVING_BYTES)
+        error = (LEFT_OUT / self._detail) ** 2 * self._shown
+        least = self._large_terms.least_of_error(size[0], error, self._most_bytes)
         leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
         take_back()
         tiles.multiply_one(values, size, leasts, out, has_few=np.zeros(1, np.bool_))

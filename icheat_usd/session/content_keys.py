@@ -96,7 +96,7 @@ def _transport_settings(quality: Quality) -> tuple[Any, ...]:
     elsewhere |= {"light_samples", "dome_samples", "dome_places", "samples_per_pixel"}
     at_records, everywhere = {"record_rays", "record_share"}, {"rays_per_row", "row_spacing", "shared_rays"}
     unused = at_records if quality.record_error is None else everywhere
-    without = elsewhere | unused | {"packing_error", "packing_spare"}
+    without = elsewhere | unused | {"packing_error", "packing_spare", "moving_detail"}
     return tuple((name, value) for name, value in asdict(quality).items() if name not in without)
 
 

@@ -59,7 +59,13 @@ class Evaluator:
         if rows is not None:
             held_back = HeldBack(parts.snapshot, parts.tracer, parts.view, parts.gather, rows)
         self.relighter = LiveRelighter(
-            parts.snapshot, parts.view, parts.gather, transport, self.lights, held_back=held_back
+            parts.snapshot,
+            parts.view,
+            parts.gather,
+            transport,
+            self.lights,
+            held_back=held_back,
+            moving_detail=quality.moving_detail,
         )
         # That bounces of more rays come of, once all that takes less is at rest.
         self._parts = None if is_coarse or not parts.has_rest_bounces else parts

@@ -27,6 +27,8 @@ class Quality:
     packing_error: float | None = None  #: relative RMS error that packed rows may add; None keeps them exact
     #: Coefficients of 64 rows, on average, that are kept even so, until that error is 0.7 of it.
     packing_spare: int = 0
+    #: While lights move, terms that are small in their light are not read: errors of that are divided by this.
+    moving_detail: float = 1.0
     light_samples: int = 16  #: shadow rays per light and point
     dome_samples: int | None = None  #: for the direct light of domes in the image; 4 `light_samples` by default
     #: Places that are told apart in learning where the light of domes comes from.
@@ -53,7 +55,13 @@ LIVE = replace(RECORDS, rest_bounce_rays=1024, packing_error=0.0275, packing_spa
 #: For a close look at what lives on: about two and a half times as many records, which twice the rays would be wasted
 #: without. Some lights lose all of what plausible ones lose by packing, and are to be within a percent nevertheless.
 LIVE_FINE = replace(
-    LIVE, record_error=0.0015, record_share=0.7, record_rays=4096, rays_per_bounce_row=1024, packing_error=0.01
+    LIVE,
+    record_error=0.0015,
+    record_share=0.7,
+    record_rays=4096,
+    rays_per_bounce_row=1024,
+    packing_error=0.01,
+    moving_detail=3.0,
 )
 FINAL = GatherSettings()
 

@@ -550,6 +550,18 @@ def after_rest(of: Pipeline, rows: PackedTransport, stack: EditStack) -> LiveRel
     return shown
 
 
+def test_rows_in_floats_stay_floats_after_rest():
+    """What edits change under other gains is not like what they changed at rest, and is multiplied."""
+    of, lights = pipeline("full"), RestingLights(pipeline("full"))
+    stack = EditStack("/stack", (edit("a", "scale", select("/floor"), select("/back", "/floor")),))
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, packed("full"), lights)
+    shown.set_stack(stack)
+    refined(shown)
+    lights.set_gain(0, (0.3, 1.2, 2.0))
+    expected = fresh(of, stack, lights.gains).relit().indirect_edited
+    np.testing.assert_allclose(shown.relit().indirect_edited, expected, rtol=0, atol=1e-4 * expected.max())
+
+
 def test_of_an_edit_beside_its_light_at_rest_as_much_is_left_out_as_of_all_of_it(monkeypatch):
     """What differs from light at rest is small, and need not be better than the edit that it is a part of."""
     of, rows = pipeline("full"), poor(packed("full"))

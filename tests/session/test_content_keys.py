@@ -103,6 +103,7 @@ def test_geometry_materials_and_the_tracer_are_in_every_key_but_the_lights() -> 
         ("record_rays", 64, set()),  # without records
         ("record_share", 0.5, set()),
         ("packing_error", 0.1, {"packed"}),
+        ("moving_detail", 2.0, set()),
         ("n_bounces", 2, {"cell_light"}),
         ("rays_per_bounce_row", 16, {"bounces", "rest_bounces", "cell_light", "training", "packed"}),
         ("rest_bounce_rays", 64, {"rest_bounces"}),

@@ -16,7 +16,6 @@ from icheat_usd.final_gather.gatherer import Gatherer, gathered_light
 from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import take_points
 from icheat_usd.relight import Relighter
-from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.scene import F32
 from icheat_usd.transport import CellLight, Transport, build_bounces, light_cells
 from icheat_usd.transport.packed import PackedTransport
@@ -200,7 +199,7 @@ def _on_curve(parts: Parts, references: References, transport: Transport, packed
     Frames leave out terms that do not show, and all that did not change; products of a frame with everything do not.
     """
     probe = references.probe
-    live = LiveRelighter(parts.snapshot, parts.view, parts.gather, packed, parts.lights)
+    live = parts.relighter(packed)
 
     def recolour(i: int) -> None:
         parts.lights.set_gain(0, (1 + 0.1 * (i % 7), 1, 0.9))

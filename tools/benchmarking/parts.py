@@ -125,7 +125,12 @@ class Parts:
 
     @cached_property
     def live(self) -> LiveRelighter:
-        return LiveRelighter(self.snapshot, self.view, self.gather, self.packed, self.lights)
+        return self.relighter(self.packed)
+
+    def relighter(self, transport: PackedTransport) -> LiveRelighter:
+        """One that was never at rest."""
+        detail = self.effort.settings().moving_detail
+        return LiveRelighter(self.snapshot, self.view, self.gather, transport, self.lights, moving_detail=detail)
 
     def shown(self, light: int, *, at_rest: bool) -> F32:
         """Indirect light of every view sample under one light alone: at once, or when nothing is left to be done."""
@@ -148,7 +153,7 @@ class Parts:
         before = self.lights.gains.copy()
         self._set_gains(gains)
         # One that was at rest before may know more of the lights than a frame does.
-        live = LiveRelighter(self.snapshot, self.view, self.gather, self.packed, self.lights)
+        live = self.relighter(self.packed)
         live.set_stack(stack)
         live.relit()
         while at_rest and live.refine():
