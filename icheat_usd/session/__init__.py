@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     from icheat_usd.session.keys import copy_key, list_keys, remove_key, set_key
     from icheat_usd.session.live import LiveSession
     from icheat_usd.session.publishing import publish
-    from icheat_usd.session.quality import DRAFT, Quality
+    from icheat_usd.session.quality import DRAFT, LIVE, LIVE_FINE, Quality
 
 __all__ = [
     "DRAFT",
+    "LIVE",
+    "LIVE_FINE",
     "GatherSettings",
     "LiveSession",
     "Quality",
@@ -66,6 +68,8 @@ _HOMES = {
     "LiveSession": "icheat_usd.session.live",
     "Session": "icheat_usd.session.document",
     "DRAFT": "icheat_usd.session.quality",
+    "LIVE": "icheat_usd.session.quality",
+    "LIVE_FINE": "icheat_usd.session.quality",
     "Quality": "icheat_usd.session.quality",
 }
 
