@@ -478,10 +478,12 @@ def test_of_lights_that_move_only_what_they_change_is_multiplied_with_packed_row
     np.testing.assert_array_equal(at_rest, refined(again))
 
 
-def fresh_packed(of: Pipeline, rows: PackedTransport, stack: EditStack, gains: F32) -> LiveRelighter:
+def fresh_packed(
+    of: Pipeline, rows: PackedTransport, stack: EditStack, gains: F32, moving_detail: float = 1.0
+) -> LiveRelighter:
     lights = StillLights(of)
     lights.gains[:] = gains
-    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights)
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, lights, moving_detail=moving_detail)
     shown.set_stack(stack)
     return shown
 
@@ -508,6 +510,27 @@ def test_a_large_transport_is_read_in_part_while_lights_move(monkeypatch):
     assert (large > 3 * small).all()
     assert (large < 5 * 0.1).all()
     assert (limited > large).all()
+
+
+@pytest.mark.parametrize(
+    ("of_version", "of_itself", "most"), [(0.005, 80.0, 10**9), (80.0, 0.08, 10**9), (0.08, 0.08, 120)]
+)
+def test_detail_while_moving_divides_what_is_left_out_and_raises_what_is_read(of_version, of_itself, most, monkeypatch):
+    of, rows = pipeline("full"), poor(packed("full"))
+    assert rows.n_bytes > 16 * 120
+    stack = EditStack("/stack", (edit("a", "scale", select("/floor"), select("/back", "/floor")),))
+    monkeypatch.setattr("icheat_usd.relight.products.SMALL_BYTES", 0)
+
+    def frame(divisor: float, most_bytes: int, detail: float) -> F32:
+        left_out = {"LEFT_OUT": 0.08, "LEFT_OUT_OF_VERSION": of_version, "LEFT_OUT_OF_ITSELF": of_itself}
+        for name, value in left_out.items():
+            monkeypatch.setattr(f"icheat_usd.relight.products.{name}", value / divisor)
+        monkeypatch.setattr("icheat_usd.relight.products.MOVING_BYTES", most_bytes)
+        return fresh_packed(of, rows, stack, np.ones((2, 3), np.float32), detail).frame()
+
+    fine = frame(1, most, 4.0)
+    assert not np.array_equal(fine, frame(1, most, 1.0))
+    np.testing.assert_array_equal(fine, frame(4, 16 * most, 1.0))
 
 
 def test_edits_of_few_cells_are_read_in_part_and_change_what_they_should(monkeypatch):

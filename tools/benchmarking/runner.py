@@ -82,7 +82,7 @@ def run_benchmark(
     for name in chosen:
         suite = _module(benchmark, name)
         results: list[dict[str, Any]] = []
-        wanted = effort.get("quality")
+        wanted = effort.get("quality")  # of suites with cases of several
         cases = suite.cases(stages, arguments.quick)
         for case in [case for case in cases if wanted is None or case.get("quality", wanted) == wanted]:
             case = {"name": short_name(case["stage"]), **options, **case}
