@@ -37,6 +37,7 @@ from icheat_usd.lighting.quick import (
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import CloserLook
+from icheat_usd.relight.grain import Grain
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, Bool, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -54,6 +55,9 @@ _RAYS_PER_STEP = 1 << 16  # of the general way
 # Places nearer to a light than so many of its extents are lit by what samples solid angles: of points spread evenly
 # over a light, those next to a place are too few and too bright.
 _NEAR = 1.0
+
+# So many times the rounds at grainy view samples: those at borders of shadows.
+_MORE = 4
 
 # Rays to the sky of each patch point and view sample, for domes on the move.
 _SKY_OF_CELLS, _SKY_OF_VIEW = 16, 8
@@ -299,7 +303,10 @@ class Following:
 
 
 class MovingLight:
-    """A light with a surface of its own, or a distant one: rounds of one shadow ray per patch point and view sample."""
+    """A light with a surface of its own, or a distant one: rounds of one shadow ray per patch point and view sample.
+
+    More of them where the image would be grainy.
+    """
 
     def __init__(
         self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
@@ -308,12 +315,17 @@ class MovingLight:
         self._shining = shining_points(alone, seed)
         self._step = self._n_found = self._n_near = 0
         self._near: I64 | None = None  # cells next to the light, from the last round on
-        self._exposed: I64 | None = None  # view samples next to it or with narrow lobes, once the bounces are done
+        #: View samples next to it or with narrow lobes, and how many rays these get, once the bounces are done.
+        self._exposed: list[tuple[I64, int]] | None = None
+        self._n_at_grain = light_samples  # rounds at what is grainy, those at all view samples among them
+        self._grainy: I32 = np.empty(0, np.int32)  # runs of view samples
+        self._is_exposed: Bool = np.zeros(0, np.bool_)  # of each view sample
         self._sampler: LightSampler | None = None
         self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self.following: Following | None = None  #: set from before to spare work
-        self._cells = self._view = np.empty((0, 3), np.float32)  # from the first step on
+        self._cells = np.empty((0, 3), np.float32)  # from the first step on
+        self._grain: Grain | None = None  # the same
 
     def show(self, radiance: F32, view_direct: F32) -> None:
         """First look: a shadow ray per cell, more where that leaves noise, and one per view sample at shadows' edges.
@@ -342,8 +354,8 @@ class MovingLight:
         """Another round at the cells or at the view; False after the last."""
         around = self._around
         assert around.patches is not None and around.tiles is not None
-        if self._step == 0:
-            self._cells, self._view = (np.zeros((n, 3), np.float32) for n in (around.gather.n, around.view.n))
+        if self._grain is None:
+            self._cells, self._grain = np.zeros((around.gather.n, 3), np.float32), Grain(around.tiles)
         turn, at_view = divmod(self._step, 2)
         self._step += 1
         if turn >= self._rounds:
@@ -354,22 +366,26 @@ class MovingLight:
             if self._exact.step(radiance):
                 return True
             self.direct = direct
-            return self._light_exposed(view_direct)
-        places, into = (around.tiles, self._view) if at_view else (around.patches, self._cells)
-        found = np.empty((places.n, 3), np.float32)
-        shadows = around.shadows_of(self._alone)
-        # Points of its own for every round: what lies next to a light sees how far they are apart.
-        seed = int(hash_combine(self._seed, turn)) & 0x7FFFFFFF
-        direct_at(self._alone, shadows, places, seed, False, found, turn, shining=shining_points(self._alone, seed))
-        into += found if at_view else around.cell_means(found)
+            return self._light_grain(view_direct) or self._light_exposed(view_direct)
         share = np.float32(1.0 / (turn + 1))
         if at_view:
-            np.multiply(into, share, out=view_direct)
+            np.multiply(self._grain.add(self._round(around.tiles, turn)), share, out=view_direct)
         else:
-            direct = into * share
+            self._cells += around.cell_means(self._round(around.patches, turn))
+            direct = self._cells * share
             around.bounce(direct, radiance, self.direct)
             self.direct = direct
         return True
+
+    def _round(self, places: Places, turn: int, runs: I32 | None = None) -> F32:
+        """What places reflect, by one shadow ray each: (n, 3), which says nothing of others than some runs."""
+        found = np.empty((places.n, 3), np.float32) if runs is None else np.zeros((places.n, 3), np.float32)
+        shadows = self._around.shadows_of(self._alone)
+        # Points of its own for every round: what lies next to a light sees how far they are apart.
+        seed = int(hash_combine(self._seed, turn)) & 0x7FFFFFFF
+        shining = shining_points(self._alone, seed)
+        direct_at(self._alone, shadows, places, seed, False, found, turn, shining=shining, runs=runs)
+        return found
 
     def restart_bounces(self) -> None:
         """Bounces are to be solved with other rows."""
@@ -393,19 +409,46 @@ class MovingLight:
         self._cells[some] = self._around.lit_cells(self._alone, self._sampler, some, seed, n) * np.float32(n)
         return True
 
+    def _light_grain(self, view_direct: F32) -> bool:
+        """Another round at the view samples that are grainy; False when none is, or all rounds are done."""
+        around, grain, n = self._around, self._grain, self._n_at_grain
+        assert around.tiles is not None and grain is not None
+        if self._exposed is None:
+            self._grainy = np.arange(around.tiles.n_runs, dtype=np.int32)
+            self._exposed = self._find_exposed(grain)
+        if n in (self._rounds, 2 * self._rounds):
+            self._grainy = grain.grainy(n, self._grainy, self._is_exposed)
+        if n >= _MORE * self._rounds or not len(self._grainy):
+            return False
+        samples = grain.samples(self._grainy)
+        total = grain.add(self._round(around.tiles, n, self._grainy), samples)
+        self._n_at_grain += 1
+        view_direct[samples] = total / np.float32(n + 1)
+        return True
+
+    def _find_exposed(self, grain: Grain) -> list[tuple[I64, int]]:
+        """Steps of lighting the view samples next to the light or with narrow lobes: samples, and rays of each."""
+        n = self._rounds
+        is_grainy = np.zeros(self._around.view.n, np.bool_)
+        is_grainy[grain.samples(grain.grainy(n, self._grainy, is_grainy))] = True
+        self._is_exposed = _is_near(self._around.view.points.position, self._shining)
+        self._is_exposed[self._around.smooth] = True
+        steps: list[tuple[I64, int]] = []
+        for some, n_rays in ((~is_grainy, n), (is_grainy, _MORE * n)):
+            samples = np.flatnonzero(self._is_exposed & some)
+            at_once = max(1, _RAYS_PER_STEP // n_rays)
+            steps += [(samples[first : first + at_once], n_rays) for first in range(0, len(samples), at_once)]
+        return steps
+
     def _light_exposed(self, view_direct: F32) -> bool:
         """Light some more of the view samples next to the light or with narrow lobes; False after the last."""
-        around, first = self._around, self._n_found
-        view = around.view
-        if self._exposed is None:
-            near = np.flatnonzero(_is_near(view.points.position, self._shining))
-            self._exposed = np.union1d(near, around.smooth)
-        rows = self._exposed[first : first + max(1, _RAYS_PER_STEP // self._rounds)]
-        if len(rows):
+        assert self._exposed is not None
+        if self._n_found < len(self._exposed):
             assert self._sampler is not None
-            seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
-            view_direct[rows] = around.lit_view(self._alone, self._sampler, rows, seed, self._rounds)
-        self._n_found += len(rows)
+            rows, n_rays = self._exposed[self._n_found]
+            seed = int(hash_combine(self._seed, self._n_found)) & 0x7FFFFFFF
+            view_direct[rows] = self._around.lit_view(self._alone, self._sampler, rows, seed, n_rays)
+            self._n_found += 1
         return self._n_found < len(self._exposed)
 
 

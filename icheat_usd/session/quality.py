@@ -29,7 +29,7 @@ class Quality:
     packing_spare: int = 0
     #: While lights move, terms that are small in their light are not read: errors of that are divided by this.
     moving_detail: float = 1.0
-    light_samples: int = 16  #: shadow rays per light and point
+    light_samples: int = 16  #: shadow rays per light and point, at rest; more where an image is grainy
     dome_samples: int | None = None  #: for the direct light of domes in the image; 4 `light_samples` by default
     #: Places that are told apart in learning where the light of domes comes from.
     dome_places: int = 512

@@ -206,6 +206,22 @@ def test_next_to_a_light_there_is_as_little_noise_as_elsewhere() -> None:
     assert np.sqrt(((lights.view_direct[0] - direct) ** 2).sum() / (direct**2).sum()) < 0.03
 
 
+def test_rays_beyond_the_first_are_sent_at_rest_alone_and_take_its_noise(scene: Pipeline) -> None:
+    lit = room(RECT, SPHERE)
+    few, many = (build(scene, lit, n) for n in (2, 32))
+    for _ in range(2):
+        np.testing.assert_array_equal(many.radiance, few.radiance)
+        np.testing.assert_array_equal(many.view_direct, few.view_direct)
+        for lights in (few, many):
+            lights.change(1, to_world=translation(-0.4, 0.2, 0.5)[:3])
+    true = settle(build(scene, few.snapshot(), 90)).view_direct
+
+    def off(lights: LiveLights) -> float:
+        return float(np.square(settle(lights).view_direct - true).sum())
+
+    assert off(many) < off(few) / 4
+
+
 def test_any_number_of_threads_gives_the_same_light(scene: Pipeline) -> None:
     """At rest, and for a dome at first look."""
     without_dome = room(RECT, SPHERE)
