@@ -25,6 +25,7 @@ class Grain:
         self._row = tiles.row
         self._sum: F32 = np.zeros((tiles.n, 3), np.float32)
         self._squares: F32 = np.zeros(tiles.n, np.float32)
+        self._n: I32 = np.zeros(tiles.n, np.int32)  # rounds
 
     def samples(self, runs: I32) -> I64:
         """View samples of some runs."""
@@ -37,10 +38,11 @@ class Grain:
         new = found[samples]
         self._sum[samples] += new
         self._squares[samples] += np.square(new.mean(axis=1))
+        self._n[samples] += 1
         return self._sum[samples]
 
-    def grainy(self, n_rounds: int, runs: I32, known: Bool) -> I32:
-        """Those of some runs, ascending, that are grainy after so many rounds at them.
+    def grainy(self, runs: I32, known: Bool) -> I32:
+        """Those of some runs, ascending, that are grainy after all rounds so far, of which there must be two.
 
         Rounds are taken to be independent. They are spread over the light, so that less noise is left.
 
@@ -49,14 +51,16 @@ class Grain:
         known : (n_view,) bool
             Samples whose noise does not matter.
         """
-        if n_rounds < 2 or not len(runs):
-            return runs[:0]
+        if not len(runs):
+            return runs
         samples, begin = self.samples(runs), np.arange(len(runs)) * RUN
-        mean = self._sum[samples].mean(axis=1, dtype=np.float64) / n_rounds
+        of_all = float((self._sum.mean(axis=1, dtype=np.float64) / np.maximum(self._n, 1)).mean())
+        n = np.maximum(self._n[samples], 1)
+        mean = self._sum[samples].mean(axis=1, dtype=np.float64) / n
         # Of the mean over the rounds, from how they differ.
-        variance = np.maximum(self._squares[samples] / n_rounds - mean * mean, 0) / (n_rounds - 1)
+        variance = np.maximum(self._squares[samples] / n - mean * mean, 0) / np.maximum(n - 1, 1)
         variance[known[samples]] = 0
         size = np.diff(np.append(begin, len(samples)))
-        light = np.add.reduceat(mean, begin) / size + OF_ALL * float(self._sum.mean(dtype=np.float64)) / n_rounds
+        light = np.add.reduceat(mean, begin) / size + OF_ALL * of_all
         noise: F64 = np.sqrt(np.add.reduceat(variance, begin) / size)
         return runs[noise > LEAST_GRAIN * light]

@@ -417,7 +417,7 @@ class MovingLight:
             self._grainy = np.arange(around.tiles.n_runs, dtype=np.int32)
             self._exposed = self._find_exposed(grain)
         if n in (self._rounds, 2 * self._rounds):
-            self._grainy = grain.grainy(n, self._grainy, self._is_exposed)
+            self._grainy = grain.grainy(self._grainy, self._is_exposed)
         if n >= _MORE * self._rounds or not len(self._grainy):
             return False
         samples = grain.samples(self._grainy)
@@ -430,7 +430,7 @@ class MovingLight:
         """Steps of lighting the view samples next to the light or with narrow lobes: samples, and rays of each."""
         n = self._rounds
         is_grainy = np.zeros(self._around.view.n, np.bool_)
-        is_grainy[grain.samples(grain.grainy(n, self._grainy, is_grainy))] = True
+        is_grainy[grain.samples(grain.grainy(self._grainy, is_grainy))] = True
         self._is_exposed = _is_near(self._around.view.points.position, self._shining)
         self._is_exposed[self._around.smooth] = True
         steps: list[tuple[I64, int]] = []

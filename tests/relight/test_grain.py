@@ -31,8 +31,8 @@ def test_grain_is_that_of_a_plain_loop() -> None:
     """From all rounds at once, instead of their sums; the last run is not full."""
     rng = np.random.default_rng(2)
     tiles = places(5 * RUN + 9, rng)
-    # Runs of more and more noise, one without any, and one where none matters.
-    spread = np.array([0.0, 0.02, 0.1, 0.5, 2.0, 2.0], np.float32)[np.argsort(tiles.row) // RUN]
+    # Noise of runs: none, none that shows, just enough to show, much, and as much where it does not matter.
+    spread = np.array([0.0, 0.02, 0.287, 0.5, 2.0, 2.0], np.float32)[np.argsort(tiles.row) // RUN]
     rounds = (1 + spread[None, :, None] * (rng.random((ROUNDS, tiles.n, 3)) - 0.5)).astype(np.float32)
     grain, known = Grain(tiles), np.zeros(tiles.n, np.bool_)
     for found in rounds:
@@ -47,9 +47,14 @@ def test_grain_is_that_of_a_plain_loop() -> None:
         if np.sqrt(variance.mean()) > LEAST_GRAIN * (level[:, samples].mean() + OF_ALL * level.mean()):
             expected.append(run)
     every = np.arange(6, dtype=np.int32)
-    assert grain.grainy(ROUNDS, every, known).tolist() == expected == [3, 5]
-    assert grain.grainy(ROUNDS, every[:4], known).tolist() == [3]
-    assert not len(grain.grainy(1, every, known))  # one round says nothing
+    assert grain.grainy(every, known).tolist() == expected == [2, 3, 5]
+    assert grain.grainy(every[:4], known).tolist() == [2, 3]
+    first = Grain(tiles)
+    first.add(rounds[0])
+    assert not len(first.grainy(every, known))  # one round says nothing
+    # More rounds at one run leave the level of all as it is.
+    grain.add(rounds[0], grain.samples(every[3:4]))
+    assert grain.grainy(every, known).tolist() == [2, 3, 5]
 
 
 def test_rounds_at_some_runs_leave_the_others_alone() -> None:
