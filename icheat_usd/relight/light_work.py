@@ -414,8 +414,12 @@ class MovingLight:
         around, grain, n = self._around, self._grain, self._n_at_grain
         assert around.tiles is not None and grain is not None
         if self._exposed is None:
+            self._is_exposed = _is_near(around.view.points.position, self._shining)
+            self._is_exposed[around.smooth] = True
             self._grainy = np.arange(around.tiles.n_runs, dtype=np.int32)
-            self._exposed = self._find_exposed(grain)
+            self._exposed = self._steps_of_exposed(
+                grain.samples(grain.grainy(self._grainy, np.zeros_like(self._is_exposed)))
+            )
         if n in (self._rounds, 2 * self._rounds):
             self._grainy = grain.grainy(self._grainy, self._is_exposed)
         if n >= _MORE * self._rounds or not len(self._grainy):
@@ -426,15 +430,12 @@ class MovingLight:
         view_direct[samples] = total / np.float32(n + 1)
         return True
 
-    def _find_exposed(self, grain: Grain) -> list[tuple[I64, int]]:
-        """Steps of lighting the view samples next to the light or with narrow lobes: samples, and rays of each."""
-        n = self._rounds
-        is_grainy = np.zeros(self._around.view.n, np.bool_)
-        is_grainy[grain.samples(grain.grainy(self._grainy, is_grainy))] = True
-        self._is_exposed = _is_near(self._around.view.points.position, self._shining)
-        self._is_exposed[self._around.smooth] = True
+    def _steps_of_exposed(self, grainy: I64) -> list[tuple[I64, int]]:
+        """View samples to be lit in each step, and rays of each of them, which are more for the `grainy` ones."""
+        is_grainy = np.zeros(len(self._is_exposed), np.bool_)
+        is_grainy[grainy] = True
         steps: list[tuple[I64, int]] = []
-        for some, n_rays in ((~is_grainy, n), (is_grainy, _MORE * n)):
+        for some, n_rays in ((~is_grainy, self._rounds), (is_grainy, _MORE * self._rounds)):
             samples = np.flatnonzero(self._is_exposed & some)
             at_once = max(1, _RAYS_PER_STEP // n_rays)
             steps += [(samples[first : first + at_once], n_rays) for first in range(0, len(samples), at_once)]
