@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from icheat_usd import __version__
-from icheat_usd.cli.interrupts import dropped_interrupts_again
+from icheat_usd.cli.interrupts import lost_interrupts_again
 from icheat_usd.errors import IcheatError
 
 #: Modules of `icheat_usd.cli`, in the order of the help; each has a docstring (its help), `setup_parser` and `command`.
@@ -91,7 +91,14 @@ def add_verb(verbs: argparse._SubParsersAction[Any], name: str, module: object) 
 
 def run(arguments: list[str] | None = None) -> int:
     """Run one command line; every failure becomes one line on stderr and an exit status."""
-    given = sys.argv[1:] if arguments is None else arguments
+    try:
+        return _run(sys.argv[1:] if arguments is None else arguments)
+    except KeyboardInterrupt:
+        print("\nicheat: interrupted; nothing was left half-written", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(given: list[str]) -> int:
     try:
         options = build_parser().parse_args(given)
         options.given = given
@@ -103,13 +110,10 @@ def run(arguments: list[str] | None = None) -> int:
     except SystemExit as end:  # --help, --version
         return int(end.code or 0)
     try:
-        with dropped_interrupts_again():
+        with lost_interrupts_again():
             status = int(options.command(options))
         sys.stdout.flush()
         return status
-    except KeyboardInterrupt:
-        print("\nicheat: interrupted; nothing was left half-written", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         # The reader left (`icheat tree … | head`). Keep the interpreter's last flush from complaining about it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
