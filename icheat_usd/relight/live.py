@@ -30,11 +30,13 @@ from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.pair_products import PairProducts
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.relighter import RelitView
+from icheat_usd.relight.rest_weights import RestWeights
 from icheat_usd.relight.shared_light import OwnLight, SharedLight, seen_samples
 from icheat_usd.relight.term_tables import TermTables
 from icheat_usd.relight.versions import Versions
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I64, Bool, SceneSnapshot
+from icheat_usd.tracing import Tracer
 from icheat_usd.transport import HeldBack, Transport
 from icheat_usd.transport.packed import PackedTransport
 
@@ -74,6 +76,8 @@ class LiveRelighter:
         Needed by edits that let light pass occluders.
     moving_detail
         Of light not seen before, errors of terms that are not read are divided by this; frames take longer.
+    tracer : Tracer, optional
+        With it, weights of interpolation are fitted to lights at rest, see `relight.rest_weights`.
     """
 
     def __init__(
@@ -86,7 +90,9 @@ class LiveRelighter:
         *,
         held_back: HeldBack | None = None,
         moving_detail: float = 1.0,
+        tracer: Tracer | None = None,
     ) -> None:
+        self._tracer = tracer
         self._moving_detail = moving_detail
         self.view, self.gather, self.lights, self.held_back = view, gather, lights, held_back
         self._snapshot = snapshot
@@ -114,10 +120,10 @@ class LiveRelighter:
                 raise SampleSetMismatch(
                     f"the transport has {len(lobe.tint)} view samples, the view {self.view.n}; build it for this view"
                 )
+        self.transport = transport = _with_own_weights(transport)
         exact = transport.source if isinstance(transport, PackedTransport) else transport
         if exact is None:
             self._refuse_pairs()
-        self.transport = transport
         self._films.forget()
         self._amounts.forget()
         self._products = Products(transport, self.gather.tree, detail=self._moving_detail)
@@ -126,10 +132,14 @@ class LiveRelighter:
         self._exact_products: Products | None = None
         self._n_exact = 0  # tiles of exact rows that the unedited light has
         self._narrow: Narrow | None = None
+        self._rest_weights: RestWeights | None = None
         # Where no gather ray meets a surface, there are no rows, and packing loses nothing.
         if exact is not None and exact is not transport and self._products.names:
             self._exact_products = Products(exact, self.gather.tree, self._products.names)
             self._narrow = Narrow(self._products, self._exact_products)
+            if self._tracer is not None and exact.interpolation is not None:
+                scene = self._snapshot, self._tracer, self.view, self.gather
+                self._rest_weights = RestWeights(*scene, exact, self._products.names)
         # Uncompressed means exact: what is interpolated is then the transport alone, not what edits make of it.
         self._stack.set_at_records(isinstance(transport, PackedTransport) or transport.interpolation is None)
         self._regroup()
@@ -240,7 +250,7 @@ class LiveRelighter:
         unedited, edited = (np.maximum(light, np.float32(0)) for light in (self._unedited(), self._edited()))
         return RelitView(np.ascontiguousarray(self.lights.direct(), np.float32), unedited, edited)
 
-    def refine(self) -> bool:
+    def refine(self, *, fits: bool = True) -> bool:
         """At rest: bring lights to their final quality, then take back what packing lost; False when nothing is left.
 
         What is reached then depends on lights and stack alone. From then on the unedited light of every light that
@@ -249,6 +259,11 @@ class LiveRelighter:
         have in common with what it was is multiplied, at rest with the part of the packed rows that matters to these
         lights and edits. Versions that are new, or whose casters were painted, are multiplied as a whole. Where edited
         light is a sum over lights, each has an image at last, and under other gains a frame is the sum of these.
+
+        Parameters
+        ----------
+        fits
+            Whether these lights stay, so that fitting weights to them is worth some seconds.
         """
         if self.lights.refine():
             return True
@@ -266,9 +281,28 @@ class LiveRelighter:
                 self._n_exact = self._shared.refine_unedited(self._light(), self._exact_products, self._n_exact)
                 self._base_stale = True
                 return True
+            if fits and self._moves_seen is not None and self._fit(self._narrow):
+                return True
             self._show(self._mixed_samples)
             return self._films.step(self._at_rest(), self.lights.radiance, self.lights.view_direct, self._moves_seen)
         return False
+
+    def _fit(self, narrow: Narrow) -> bool:
+        """Do a part of fitting weights to the lights; False when nothing is left."""
+        rest = self._rest_weights
+        if rest is None or rest.is_done:
+            return False
+        is_last = rest.step(narrow.products_of, self.lights.radiance)
+        if is_last:
+            self._take_weights()
+        return True
+
+    def _take_weights(self) -> None:
+        """Weights of the interpolation are others."""
+        self._table = _table(self._products)
+        self._shared.take_weights(self._table)
+        self._base_stale = True
+        self._amounts.forget()
 
     # Structure --------------------------------------------------------------------------------------------------------
 
@@ -551,6 +585,8 @@ class LiveRelighter:
         if moved is None or moved != self._moves_seen:
             if self._narrow is not None:
                 self._narrow.forget(getattr(self.lights, "light_moves", None))
+            if self._rest_weights is not None and self._rest_weights.forget():
+                self._take_weights()
             self._films.forget()
         self._moves_seen = moved
 
@@ -618,6 +654,18 @@ class LiveRelighter:
         for row in np.flatnonzero(stack.compiled.way == Way.VIEW):
             masks[row] = stack.receiver_mask(row)[samples]
         return Ends(masks, None, ())
+
+
+def _with_own_weights(transport: PackedTransport | Transport) -> PackedTransport | Transport:
+    """The transport with weights of interpolation that nobody else has, as they change at rest."""
+    spread = transport.interpolation
+    if spread is None:
+        return transport
+    own = replace(spread, weights=spread.weights.copy())
+    if isinstance(transport, PackedTransport):
+        source = None if transport.source is None else replace(transport.source, interpolation=own)
+        return replace(transport, interpolation=own, source=source)
+    return replace(transport, interpolation=own)
 
 
 def _table(products: Products) -> FilmTable:

@@ -67,6 +67,11 @@ class SharedLight:
         #: (n_lobes, n_tiles + n_sums, 64, 4) unedited products, then the sums
         self._sums: F32 = products.room(products.n_tiles)
 
+    def take_weights(self, table: FilmTable) -> None:
+        """Go on with a table that differs from the present one in weights alone."""
+        self._base = table
+        self._edited = table._replace(row=self._edited.row, more_row=self._edited.more_row)
+
     def place(self, samples: I64, groups: SampleGroups, shared: Bool) -> None:
         """Let the table name what some samples share; `shared` (n_groups + 1,) says which groups do."""
         base, edited = self._base, self._edited

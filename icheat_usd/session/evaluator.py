@@ -66,6 +66,7 @@ class Evaluator:
             self.lights,
             held_back=held_back,
             moving_detail=quality.moving_detail,
+            tracer=parts.tracer,
         )
         # That bounces of more rays come of, once all that takes less is at rest.
         self._parts = None if is_coarse or not parts.has_rest_bounces else parts
@@ -111,7 +112,7 @@ class Evaluator:
 
     def refine(self) -> bool:
         """A bounded piece of work towards what the settings ask for; False when nothing is left."""
-        return self.relighter.refine()
+        return self.relighter.refine(fits=not self.wants_bounces)
 
     @property
     def wants_bounces(self) -> bool:

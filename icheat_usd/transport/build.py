@@ -9,7 +9,7 @@ import numpy as np
 from icheat_usd.materials import is_glossy, take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, I32, I64, SceneSnapshot
+from icheat_usd.scene import F32, I32, I64, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport.allotment import Counts
 from icheat_usd.transport.interpolate import sparse_rows_of_view
@@ -105,15 +105,40 @@ def build_transport(
 
     numbers = row_view.astype(np.int64)
     stream = np.zeros_like(numbers) if shared_rays else numbers
-    one_each = np.arange(len(row_view) + 1, dtype=np.int64)
     points = take_points(view.points, numbers)
-    diffuse = builder.diffuse_rows(points, one_each, stream, rays_per_row, 0, progress, "gather rays")
-    lobes = [Lobe("diffuse", diffuse, view.points.albedo)]
+    rows = rows_of_points(builder, points, view.to_eye[row_view], stream, rays_per_row, progress)
+    lobes = lobes_of_rows(rows, view.points)
+    return Transport(lobes, row_view, interpolation, rays_per_row, seed, stream if shared_rays else None)
 
+
+def rows_of_points(
+    builder: RowBuilder,
+    points: SurfacePoints,
+    to_eye: F32,
+    stream: I64,
+    n_rays: int,
+    progress: Progress = silent,
+) -> dict[str, SparseRows]:
+    """Rows of some points by the name of their lobe; those for gloss are there if one of the points has any.
+
+    Parameters
+    ----------
+    to_eye : (n, 3) float32
+    stream : (n,)
+        Number of each row's sequence of rays.
+    n_rays
+        Per row and lobe.
+    """
+    one_each = np.arange(len(stream) + 1, dtype=np.int64)
+    rows = {"diffuse": builder.diffuse_rows(points, one_each, stream, n_rays, 0, progress, "gather rays")}
     glossy = np.flatnonzero(is_glossy(points))
     if len(glossy):
-        base, edge = builder.specular_rows(points, view.to_eye[row_view], stream, glossy, rays_per_row, progress)
-        lobes.append(Lobe("specular_base", base, view.points.specular))
-        lobes.append(Lobe("specular_edge", edge, view.points.specular_edge))
+        base, edge = builder.specular_rows(points, to_eye, stream, glossy, n_rays, progress)
+        rows |= {"specular_base": base, "specular_edge": edge}
+    return rows
 
-    return Transport(tuple(lobes), row_view, interpolation, rays_per_row, seed, stream if shared_rays else None)
+
+def lobes_of_rows(rows: dict[str, SparseRows], points: SurfacePoints) -> tuple[Lobe, ...]:
+    """Rows by the name of their lobe, with the colours of all view samples."""
+    tints = {"diffuse": points.albedo, "specular_base": points.specular, "specular_edge": points.specular_edge}
+    return tuple(Lobe(name, of_lobe, tints[name]) for name, of_lobe in rows.items())

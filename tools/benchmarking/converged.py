@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icheat_usd.materials import is_glossy, take_points
-from icheat_usd.progress import silent
+from icheat_usd.materials import take_points
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.samples.wavelets import haar_forward, haar_inverse
-from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.scene import F32, I64, Bool, SceneSnapshot
 from icheat_usd.tracing import Tracer
-from icheat_usd.transport import Lobe, SparseRows, Transport
+from icheat_usd.transport import SparseRows, Transport
+from icheat_usd.transport.build import lobes_of_rows, rows_of_points
 from icheat_usd.transport.packed import LANES, PackedRows, PackedTransport
 from icheat_usd.transport.rays import RowBuilder
 from icheat_usd.transport.sparse import take_rows
@@ -107,16 +107,8 @@ def converged_transport(
     """
     builder = RowBuilder(snapshot, tracer, gather, seed)
     number = np.arange(view.n, dtype=np.int64)
-    stream = number if stream is None else stream
-    one_each = np.arange(view.n + 1, dtype=np.int64)
-    diffuse = builder.diffuse_rows(view.points, one_each, stream, n_rays, 0, silent, "")
-    lobes = [Lobe("diffuse", diffuse, view.points.albedo)]
-    glossy = np.flatnonzero(is_glossy(view.points))
-    if len(glossy):
-        base, edge = builder.specular_rows(view.points, view.to_eye, stream, glossy, n_rays, silent)
-        lobes.append(Lobe("specular_base", base, view.points.specular))
-        lobes.append(Lobe("specular_edge", edge, view.points.specular_edge))
-    return Transport(tuple(lobes), number.astype(np.int32), None, n_rays, seed)
+    rows = rows_of_points(builder, view.points, view.to_eye, number if stream is None else stream, n_rays)
+    return Transport(lobes_of_rows(rows, view.points), number.astype(np.int32), None, n_rays, seed)
 
 
 def converged_products(
@@ -217,6 +209,12 @@ def lossy_errors(
                     out[kind, half, here] += tint * (spread.matmul(products) - exact[: len(some)])
     interpolated, with_packing = out.reshape(2, 2, len(samples), n_lights, 3).transpose(0, 1, 3, 2, 4)
     return interpolated, with_packing
+
+
+def changed_rows(before: SparseRows, after: SparseRows) -> Bool:
+    """Which rows of two matrices with entries in the same places have other weights: (n_rows,)."""
+    n_changed = np.concatenate([[0], np.cumsum(before.weights != after.weights)])
+    return np.asarray(np.diff(n_changed[before.indptr]) > 0)
 
 
 def samples_of_noisy_pixels(probe: Probe, losses: tuple[F32, F32], n: int) -> I64:

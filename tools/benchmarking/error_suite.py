@@ -64,7 +64,7 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
 
 def _tables(results: list[dict[str, Any]]) -> list[str]:
     lines = [
-        "| stage, light | compression and interpolation | interpolation, all that is lost at rest | total"
+        "| stage, light | compression and interpolation | what is lost at rest | total"
         " | while it moves | at rest | largest pixel | cells against true hits |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
@@ -74,14 +74,14 @@ def _tables(results: list[dict[str, Any]]) -> list[str]:
             lossy = light.get("interpolation_and_packing") or light.get("packing")
             hits = result.get("cells_against_true_hits", {}).get(name)
             lines.append(
-                f"| {stage}, {name} | {_percent(lossy)} | {_percent(light.get('interpolation'))} |"
+                f"| {stage}, {name} | {_percent(lossy)} | {_percent(light.get('lossy_at_rest'))} |"
                 f" {_percent(light['total'])} | {_percent(light['while_moving'])} | {_percent(light['at_rest'])} |"
                 f" {100 * light['total']['largest']:.0f} % | {_percent(hits)} |"
             )
     if found:
         figures = overview(found)
         lines.append(
-            f"| median; worst | {_both(figures, 'interpolation_and_packing')} | {_both(figures, 'interpolation')} |"
+            f"| median; worst | {_both(figures, 'interpolation_and_packing')} | {_both(figures, 'lossy_at_rest')} |"
             f" {_both(figures, 'total')} | {_both(figures, 'while_moving')} | {_both(figures, 'at_rest')} | | |"
         )
     lines += [

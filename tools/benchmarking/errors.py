@@ -21,6 +21,7 @@ from icheat_usd.transport import CellLight, Transport, build_bounces, light_cell
 from icheat_usd.transport.packed import PackedTransport
 from tools.benchmarking.converged import (
     Probe,
+    changed_rows,
     choose_pixels,
     converged_products,
     converged_transport,
@@ -157,7 +158,7 @@ def _difference(image: F32, exact: F32, references: References, light: int) -> R
 def _lossy(
     parts: Parts, references: References, settings: ErrorSettings, names: list[str]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What interpolation alone loses, and with packing: rows at the records as converged as those at the pixels."""
+    """What is lost with packing, without, and at rest: rows at the records as converged as those at the pixels."""
     if parts.transport.interpolation is None:
         return
     probe = references.probe.part(settings.record_pixels, settings.seed)
@@ -171,10 +172,22 @@ def _lossy(
     again = lossy_errors(*scene, parts.packed, probe.samples[noisy], settings.noisy_rays, seeds, own)
     for off, better in zip(losses, again, strict=True):
         off[:, :, noisy] = better
+    # At rest nothing is packed, and some samples have other weights.
+    while parts.live.refine():
+        pass
+    at_rest = parts.live.transport.interpolation
+    assert at_rest is not None
+    changed = np.flatnonzero(changed_rows(parts.transport.interpolation, at_rest)[probe.samples])
+    fitted = replace(parts.packed, source=replace(parts.transport, interpolation=at_rest))
+    resting = losses[0].copy()
+    seeds = settings.seed + 7000, settings.seed + 8000
+    better, _ = lossy_errors(*scene, fitted, probe.samples[changed], settings.noisy_rays, seeds, own)
+    resting[:, :, changed] = better
     for light, name in enumerate(names):
         a, b = references.same_b[0][light][kept], references.same_b[1][light][kept]
         found = {}
-        for kind, off in zip(("interpolation", "interpolation_and_packing"), losses, strict=True):
+        kinds = {"interpolation": losses[0], "interpolation_and_packing": losses[1], "lossy_at_rest": resting}
+        for kind, off in kinds.items():
             one, two = (probe.to_pixels(half) for half in off[:, light])
             found[kind] = relative_error_of_halves(a + one, b + two, a, b).as_dict()
         yield name, found
@@ -346,6 +359,7 @@ def overview(found: dict[str, Any]) -> dict[str, float]:
         "packing",
         "interpolation",
         "interpolation_and_packing",
+        "lossy_at_rest",
         "cell_light",
     ):
         values = [light[kind]["rms"] for stage in found.values() for light in stage["lights"].values() if kind in light]

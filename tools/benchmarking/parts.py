@@ -130,7 +130,8 @@ class Parts:
     def relighter(self, transport: PackedTransport) -> LiveRelighter:
         """One that was never at rest."""
         detail = self.effort.settings().moving_detail
-        return LiveRelighter(self.snapshot, self.view, self.gather, transport, self.lights, moving_detail=detail)
+        scene = self.snapshot, self.view, self.gather, transport, self.lights
+        return LiveRelighter(*scene, moving_detail=detail, tracer=self.tracer)
 
     def shown(self, light: int, *, at_rest: bool) -> F32:
         """Indirect light of every view sample under one light alone: at once, or when nothing is left to be done."""

@@ -1,0 +1,197 @@
+"""Weights of interpolation that fit the lights at rest, at view samples whose records these lights differ much at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from icheat_usd.materials import take_points
+from icheat_usd.samples import GatherSamples, ViewSamples
+from icheat_usd.scene import F32, F64, I64, SceneSnapshot
+from icheat_usd.tracing import Tracer
+from icheat_usd.transport import Transport
+from icheat_usd.transport.build import rows_of_points
+from icheat_usd.transport.rays import RowBuilder
+
+#: Samples are fitted whose records differ by more than this of the image's root mean square, in any light; of these
+#: those that differ most, so many of all and no more than can be looked at in some seconds.
+LEAST_DIFFERENCE, MOST_SHARE, MOST = 0.1, 0.01, 4096
+#: Rays of each of them and lobe, in each of two estimates. Half as many made grazing lights worse.
+RAYS = 2048
+#: How strongly weights stay near the given ones, in units of the mean curvature.
+PRIOR = 0.05
+#: Samples that are looked at in one step: some tens of milliseconds.
+_TOGETHER = 24
+#: Of the seed of the rows: rays are others.
+_OTHER_RAYS = 0x5EE4
+
+
+class RestWeights:
+    """Fits weights in steps, and gives back those that there were before when lights change.
+
+    Interpolation is chosen for lights of any kind. Where geometry is a pixel wide it can be off by half of what one
+    light brings to a sample, of which the light itself tells: its records differ much in it. Such samples are looked
+    at with rays of their own under the lights at hand, and their weights are moved by least squares to what is seen,
+    as far as that is no noise. Edits, groups and images of lights then come of these weights as they do of others.
+
+    Parameters
+    ----------
+    transport : Transport
+        Exact rows. The weights of its interpolation are changed in place.
+    names
+        Of the lobes that have rows.
+    """
+
+    def __init__(
+        self,
+        snapshot: SceneSnapshot,
+        tracer: Tracer,
+        view: ViewSamples,
+        gather: GatherSamples,
+        transport: Transport,
+        names: tuple[str, ...],
+    ) -> None:
+        assert transport.interpolation is not None
+        self._view, self._spread = view, transport.interpolation
+        self._given = self._spread.weights.copy()
+        self._lobes = [(lobe.name, lobe.tint) for lobe in transport.lobes if lobe.name in names]
+        self._builders = [RowBuilder(snapshot, tracer, gather, transport.seed + _OTHER_RAYS + half) for half in (0, 1)]
+        self._work: Iterator[None] | None = None
+        self._is_done = False
+        self._is_fitted = False
+
+    def forget(self) -> bool:
+        """Take the weights that there were before, for other lights; whether that changes any."""
+        changed = self._is_fitted
+        if changed:
+            self._spread.weights[:] = self._given
+        self._work, self._is_done, self._is_fitted = None, False, False
+        return changed
+
+    @property
+    def is_done(self) -> bool:
+        """Whether weights fit the lights: nothing is left to do until `forget`."""
+        return self._is_done
+
+    def step(self, products_of: Callable[[int], F32], radiance: F32) -> bool:
+        """Do a part of the work; true after the last, which may have changed weights.
+
+        Parameters
+        ----------
+        products_of
+            Exact products of a light with all rows: (n_lobes, n_tiles, 64, 4).
+        radiance : (n_lights, n_gather, 3)
+            The same in every step.
+        """
+        if self._work is None:
+            self._work = self._fit(products_of, radiance)
+        self._is_done = next(self._work, self) is self
+        if self._is_done:
+            self._work = None
+        return self._is_done
+
+    def _fit(self, products_of: Callable[[int], F32], radiance: F32) -> Iterator[None]:
+        products, shining = [], []
+        differs = np.zeros(self._view.n)
+        for light, of_light in enumerate(radiance):
+            at_rows = products_of(light)
+            at_rows = np.ascontiguousarray(at_rows.reshape(len(at_rows), -1, 4)[:, : self._spread.n_columns, :3])
+            square, found = self._differences(at_rows)
+            if square > 0:
+                # All in units of the light's image, so that each light counts alike.
+                level = np.float32(np.sqrt(square))
+                products.append(at_rows / level)
+                shining.append(of_light / level)
+                np.maximum(differs, found / square, out=differs)
+            yield
+        samples = _most_different(differs)
+        if not len(samples):
+            return
+        columns = np.concatenate(shining, axis=1)
+        seen = np.empty((2, len(samples), columns.shape[1]), np.float32)
+        for first in range(0, len(samples), _TOGETHER):
+            for half, builder in enumerate(self._builders):
+                part = slice(first, first + _TOGETHER)
+                seen[half, part] = self._look(builder, samples[part], columns)
+                yield
+        self._put(samples, np.concatenate(products, axis=2), seen)
+
+    def _differences(self, at_rows: F32) -> tuple[float, F64]:
+        """Mean square of a light's image, and how its records differ at each sample: the variance, with their weights.
+
+        `at_rows` is (n_lobes, n_rows, 3).
+        """
+        image = np.zeros((self._view.n, 3))
+        differs = np.zeros(self._view.n)
+        for (_, tint), values in zip(self._lobes, at_rows, strict=True):
+            mean, square = (self._spread.matmul(power).astype(np.float64) for power in (values, values**2))
+            image += tint * mean
+            differs += (np.square(tint.astype(np.float64)) * np.maximum(square - mean**2, 0)).mean(axis=1)
+        return float(np.mean(image**2)), differs
+
+    def _look(self, builder: RowBuilder, samples: I64, light: F32) -> F32:
+        """What rays of their own say of some samples, (n, k), of light (n_gather, k) of several lights and channels."""
+        points = take_points(self._view.points, samples)
+        rows = rows_of_points(builder, points, self._view.to_eye[samples], samples, RAYS)
+        out = np.zeros((len(samples), light.shape[1]), np.float32)
+        for name, tint in self._lobes:
+            if name in rows:
+                out += np.tile(tint[samples], light.shape[1] // 3) * rows[name].matmul(light)
+        return out
+
+    def _put(self, samples: I64, at_rows: F32, seen: F32) -> None:
+        """Change the weights of samples, ascending, towards what two estimates (2, n, k) say.
+
+        Parameters
+        ----------
+        at_rows : (n_lobes, n_rows, k)
+        """
+        begin = self._spread.indptr[samples]
+        count = self._spread.indptr[samples + 1] - begin
+        entry = begin[:, None] + np.arange(count.max())
+        is_there = entry < (begin + count)[:, None]
+        entry = np.where(is_there, entry, begin[:, None])
+        given = np.where(is_there, self._given[entry], 0).astype(np.float64)
+        shown = np.zeros((*entry.shape, seen.shape[2]))
+        for (_, tint), values in zip(self._lobes, at_rows, strict=True):
+            tints = np.tile(tint[samples], seen.shape[2] // 3)
+            shown += tints[:, None] * values[self._spread.indices[entry]]
+        shown *= is_there[:, :, None]
+        fitted = fitted_weights(given, shown, seen[0], seen[1])
+        self._spread.weights[entry[is_there]] = fitted[is_there]
+        self._is_fitted = True
+
+
+def fitted_weights(given: F64, shown: F64, one: F32, other: F32) -> F64:
+    """Weights with which what records show comes close to what was seen.
+
+    Least squares with the given weights as a prior; of the step to these weights as much is taken as is sure not to be
+    noise, by the two estimates (James and Stein 1961).
+
+    Parameters
+    ----------
+    given : (n, m)
+        Of m records of each of n samples.
+    shown : (n, m, k)
+        What a sample would show with the light of each of them, 0 where it has fewer.
+    one, other : (n, k)
+        Independent estimates of what it shows.
+    """
+    one, other = one.astype(np.float64), other.astype(np.float64)
+    missing = (one + other) / 2 - np.einsum("nm,nmk->nk", given, shown)
+    noise = np.square((one - other) / 2).sum(axis=1)
+    sure = np.maximum(1 - noise / np.maximum(np.square(missing).sum(axis=1), np.finfo(np.float64).tiny), 0)
+    curvature = shown @ shown.transpose(0, 2, 1)
+    size = np.einsum("nmm->n", curvature) / np.maximum((shown != 0).any(axis=2).sum(axis=1), 1)
+    # Where no record shows anything, there is nothing to mix.
+    curvature += np.where(size > 0, PRIOR * size, 1)[:, None, None] * np.eye(given.shape[1])
+    step = np.linalg.solve(curvature, np.einsum("nmk,nk->nm", shown, missing)[..., None])[..., 0]
+    return np.asarray(given + sure[:, None] * step)
+
+
+def _most_different(differs: F64) -> I64:
+    """Samples to be fitted, ascending, of those that differ by squares of the image's root mean square."""
+    most = min(int(MOST_SHARE * len(differs)), MOST)
+    samples = np.argsort(-differs, kind="stable")[:most]
+    return np.sort(samples[differs[samples] > LEAST_DIFFERENCE**2])
