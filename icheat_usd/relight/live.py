@@ -303,6 +303,7 @@ class LiveRelighter:
         self._shared.take_weights(self._table)
         self._base_stale = True
         self._amounts.forget()
+        self._films.forget()
 
     # Structure --------------------------------------------------------------------------------------------------------
 
@@ -585,9 +586,9 @@ class LiveRelighter:
         if moved is None or moved != self._moves_seen:
             if self._narrow is not None:
                 self._narrow.forget(getattr(self.lights, "light_moves", None))
+            self._films.forget()
             if self._rest_weights is not None and self._rest_weights.forget():
                 self._take_weights()
-            self._films.forget()
         self._moves_seen = moved
 
     def _light_paths(self) -> tuple[str, ...]:

@@ -93,18 +93,21 @@ class RestWeights:
 
     def _fit(self, products_of: Callable[[int], F32], radiance: F32) -> Iterator[None]:
         products, shining = [], []
-        differs = np.zeros(self._view.n)
+        differs = np.zeros(self._view.n, np.float32)
         for light, of_light in enumerate(radiance):
             at_rows = products_of(light)
             at_rows = np.ascontiguousarray(at_rows.reshape(len(at_rows), -1, 4)[:, : self._spread.n_columns, :3])
-            square, found = self._differences(at_rows)
+            image, differs_here = np.zeros((self._view.n, 3), np.float32), np.zeros(self._view.n, np.float32)
+            for (_, tint), values in zip(self._lobes, at_rows, strict=True):
+                self._add_differences(tint, values, image, differs_here)
+                yield
+            square = np.mean(np.square(image, dtype=np.float64))
             if square > 0:
                 # All in units of the light's image, so that each light counts alike.
                 level = np.float32(np.sqrt(square))
                 products.append(at_rows / level)
                 shining.append(of_light / level)
-                np.maximum(differs, found / square, out=differs)
-            yield
+                np.maximum(differs, differs_here / np.float32(square), out=differs)
         samples = _most_different(differs)
         if not len(samples):
             return
@@ -117,18 +120,11 @@ class RestWeights:
                 yield
         self._put(samples, np.concatenate(products, axis=2), seen)
 
-    def _differences(self, at_rows: F32) -> tuple[float, F64]:
-        """Mean square of a light's image, and how its records differ at each sample: the variance, with their weights.
-
-        `at_rows` is (n_lobes, n_rows, 3).
-        """
-        image = np.zeros((self._view.n, 3))
-        differs = np.zeros(self._view.n)
-        for (_, tint), values in zip(self._lobes, at_rows, strict=True):
-            mean, square = (self._spread.matmul(power).astype(np.float64) for power in (values, values**2))
-            image += tint * mean
-            differs += (np.square(tint.astype(np.float64)) * np.maximum(square - mean**2, 0)).mean(axis=1)
-        return float(np.mean(image**2)), differs
+    def _add_differences(self, tint: F32, at_rows: F32, image: F32, differs: F32) -> None:
+        """Add what a lobe shows of a light, and the variance of its records at each sample, mean of the channels."""
+        mean, square = self._spread.matmul(at_rows), self._spread.matmul(np.square(at_rows))
+        image += tint * mean
+        differs += np.mean(np.square(tint) * np.maximum(square - np.square(mean), 0), axis=1)
 
     def _look(self, builder: RowBuilder, samples: I64, light: F32) -> F32:
         """What rays of their own say of some samples, (n, k), of light (n_gather, k) of several lights and channels."""
@@ -190,8 +186,8 @@ def fitted_weights(given: F64, shown: F64, one: F32, other: F32) -> F64:
     return np.asarray(given + sure[:, None] * step)
 
 
-def _most_different(differs: F64) -> I64:
+def _most_different(differs: F32) -> I64:
     """Samples to be fitted, ascending, of those that differ by squares of the image's root mean square."""
+    samples = np.flatnonzero(differs > LEAST_DIFFERENCE**2)
     most = min(int(MOST_SHARE * len(differs)), MOST)
-    samples = np.argsort(-differs, kind="stable")[:most]
-    return np.sort(samples[differs[samples] > LEAST_DIFFERENCE**2])
+    return np.sort(samples[np.argsort(-differs[samples], kind="stable")[:most]])

@@ -12,7 +12,7 @@ from icheat_usd.edits.model import EditStack
 from icheat_usd.relight import rest_weights
 from icheat_usd.relight.live import LiveRelighter
 from icheat_usd.relight.rest_weights import PRIOR, fitted_weights
-from icheat_usd.scene import F32, I64
+from icheat_usd.scene import F32, F64, I64
 from icheat_usd.transport import Transport, build_transport
 from tests.pipeline import Pipeline, select
 from tests.relight.test_live import RestingLights, packed_rows, poor, refined
@@ -115,6 +115,33 @@ def test_at_rest_samples_with_other_weights_show_what_their_own_rays_would():
         assert errors(shown.relit().indirect, expected, samples) < 0.4 * off
 
 
+def test_weights_are_fitted_to_what_each_record_shows(monkeypatch):
+    given = []
+
+    def look(*asked: F64 | F32) -> F64:
+        given.append(asked)
+        return fitted_weights(*asked)
+
+    monkeypatch.setattr(rest_weights, "fitted_weights", look)
+    shown = relighter(fits=True)
+    refined(shown)
+    ((weights, at_records, one, other),) = given
+    samples, exact, radiance = fitted_samples(shown), sparse().transport, sparse().cell_light.radiance
+    spread = exact.interpolation
+    scale = [np.sqrt(np.mean(exact.to_view(light).astype(np.float64) ** 2)) for light in radiance]
+    assert len(weights) == len(samples) and (one != other).any()
+    n_records = np.diff(spread.indptr)[samples]
+    assert n_records.min() < n_records.max()
+    for i, sample in enumerate(samples):
+        here = slice(*spread.indptr[sample : sample + 2])
+        np.testing.assert_array_equal(weights[i, : n_records[i]], spread.weights[here])
+        assert not weights[i, n_records[i] :].any() and not at_records[i, n_records[i] :].any()
+        for record, seen in zip(spread.indices[here], at_records[i], strict=False):
+            parts = [[lobe.tint[sample] * (lobe.rows.rows(record, record + 1).matmul(light)[0] / level)
+                      for light, level in zip(radiance, scale, strict=True)] for lobe in exact.lobes]  # fmt: skip
+            np.testing.assert_allclose(seen, np.sum(parts, axis=0).ravel(), rtol=1e-4, atol=1e-6)
+
+
 def test_nothing_else_changes():
     before, shown = relighter(fits=False), relighter(fits=True)
     refined(before)
@@ -184,8 +211,12 @@ def test_nothing_is_fitted_before_lights_stay():
     while shown.refine(fits=False):
         pass
     assert not len(fitted_samples(shown))
-    refined(shown)
+    shown.relit()
+    found = refined(shown)
     assert len(fitted_samples(shown))
+    again = relighter(fits=True)
+    np.testing.assert_array_equal(found, refined(again))
+    np.testing.assert_array_equal(shown.relit().indirect, again.relit().indirect)
 
 
 def test_lights_that_differ_little_from_record_to_record_need_no_rays(monkeypatch):
