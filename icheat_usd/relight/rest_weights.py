@@ -21,6 +21,8 @@ LEAST_DIFFERENCE, MOST_SHARE, MOST = 0.1, 0.01, 4096
 RAYS = 2048
 #: How strongly weights stay near the given ones, in units of the mean curvature.
 PRIOR = 0.05
+#: Of least squares: what is left of a step is far below its noise then.
+_SWEEPS = 60
 #: Samples that are looked at in one step: some tens of milliseconds.
 _TOGETHER = 24
 #: Of the seed of the rows: rays are others.
@@ -162,13 +164,13 @@ class RestWeights:
 def fitted_weights(given: F64, shown: F64, one: F32, other: F32) -> F64:
     """Weights with which what records show comes close to what was seen.
 
-    Least squares with the given weights as a prior; of the step to these weights as much is taken as is sure not to be
-    noise, by the two estimates (James and Stein 1961).
+    Least squares with the given weights as a prior, and none below 0: light would be, under edits or another light. Of
+    the step to these weights as much is taken as is sure not to be noise, by the two estimates (James and Stein 1961).
 
     Parameters
     ----------
     given : (n, m)
-        Of m records of each of n samples.
+        Of m records of each of n samples, not below 0.
     shown : (n, m, k)
         What a sample would show with the light of each of them, 0 where it has fewer.
     one, other : (n, k)
@@ -182,7 +184,12 @@ def fitted_weights(given: F64, shown: F64, one: F32, other: F32) -> F64:
     size = np.einsum("nmm->n", curvature) / np.maximum((shown != 0).any(axis=2).sum(axis=1), 1)
     # Where no record shows anything, there is nothing to mix.
     curvature += np.where(size > 0, PRIOR * size, 1)[:, None, None] * np.eye(given.shape[1])
-    step = np.linalg.solve(curvature, np.einsum("nmk,nk->nm", shown, missing)[..., None])[..., 0]
+    pull = np.einsum("nmk,nk->nm", shown, missing)
+    step = np.zeros_like(given)
+    for _ in range(_SWEEPS):  # of coordinate descent
+        for record, here in enumerate(curvature.transpose(1, 0, 2)):
+            slope = pull[:, record] - np.einsum("nm,nm->n", here, step)
+            step[:, record] = np.maximum(step[:, record] + slope / here[:, record], -given[:, record])
     return np.asarray(given + sure[:, None] * step)
 
 
