@@ -21,7 +21,7 @@ LEAST_DIFFERENCE, MOST_SHARE, MOST = 0.1, 0.01, 4096
 RAYS = 2048
 #: How strongly weights stay near the given ones, in units of the mean curvature.
 PRIOR = 0.05
-#: Of least squares: what is left of a step is far below its noise then.
+#: Of coordinate descent: within a thousandth of the least squares.
 _SWEEPS = 60
 #: Samples that are looked at in one step: some tens of milliseconds.
 _TOGETHER = 24
