@@ -74,12 +74,15 @@ def reflected_direct(
     to_eye: F32,
     seed: int,
     n_samples: int | Sequence[int],
+    sequence: I64 | None = None,
 ) -> F32:
     """Radiance that surface points reflect towards the eye, straight from each light.
 
     Parameters
     ----------
     to_eye : (n, 3) float32, unit
+    sequence : (n, 2) int64, optional
+        As for `irradiance`.
 
     Returns
     -------
@@ -100,8 +103,9 @@ def reflected_direct(
     eye = np.require(to_eye, np.float32, ("C", "W"))
     counts = _counts(n_samples, len(snapshot.lights.kind))
     n_specular = specular_count(counts)
-    out = _direct(snapshot, tracer, sampler, points, seed, counts, eye, n_specular)
-    draws = own_draws(0, len(points.instance))
+    sequence = own_draws(0, len(points.instance)) if sequence is None else sequence
+    out = _direct(snapshot, tracer, sampler, points, seed, counts, eye, n_specular, sequence)
+    draws = sequence * np.array([1, n_specular])
     add_specular_rays(snapshot, tracer, sampler, points, eye, draws, seed, n_specular, counts, out)
     return out
 

@@ -5,27 +5,41 @@ from __future__ import annotations
 import numpy as np
 
 from icheat_usd.kernels.shadow_lanes import RUN
-from icheat_usd.lighting.quick import Places
+from icheat_usd.samples import ViewSamples
 from icheat_usd.scene import F32, F64, I32, I64, Bool
 
 #: Noise of a run of view samples, 8 x 8 pixels, beside the light there and a part of that of all, above which it shows.
 LEAST_GRAIN, OF_ALL = 0.015, 0.1
 
 
+def order_of_tiles(view: ViewSamples) -> I64:
+    """View samples by tiles of 8 x 8 pixels, within them by quarters of quarters."""
+    y, x = np.divmod(view.pixel.astype(np.int64), view.width)
+    key = (y // 8 * (view.width // 8 + 1) + x // 8) * 64
+    for bit in range(3):
+        key += ((x >> bit & 1) << (2 * bit)) + ((y >> bit & 1) << (2 * bit + 1))
+    return np.argsort(key, kind="stable")
+
+
 class Grain:
-    """Sums over rounds of one shadow ray for each view sample, and what they say of the noise that is left.
+    """Sums over rounds of shadow rays, as many for each view sample, and what they say of the noise that is left.
 
     Parameters
     ----------
-    tiles
-        All view samples, each once.
+    order : (n_view,)
+        All view samples, each once, so that runs of them lie together.
     """
 
-    def __init__(self, tiles: Places) -> None:
-        self._row = tiles.row
-        self._sum: F32 = np.zeros((tiles.n, 3), np.float32)
-        self._squares: F32 = np.zeros(tiles.n, np.float32)
-        self._n: I32 = np.zeros(tiles.n, np.int32)  # rounds
+    def __init__(self, order: I32 | I64) -> None:
+        self._row, n = order, len(order)
+        self._sum: F32 = np.zeros((n, 3), np.float32)
+        self._squares: F32 = np.zeros(n, np.float32)
+        self._n: I32 = np.zeros(n, np.int32)  # rounds
+
+    @property
+    def runs(self) -> I32:
+        """All runs."""
+        return np.arange(-(-len(self._row) // RUN), dtype=np.int32)
 
     def samples(self, runs: I32) -> I64:
         """View samples of some runs."""
@@ -41,7 +55,7 @@ class Grain:
         self._n[samples] += 1
         return self._sum[samples]
 
-    def grainy(self, runs: I32, known: Bool) -> I32:
+    def grainy(self, runs: I32, known: Bool, most: int | None = None) -> I32:
         """Those of some runs, ascending, that are grainy after all rounds so far, of which there must be two.
 
         Rounds are taken to be independent. They are spread over the light, so that less noise is left.
@@ -50,6 +64,8 @@ class Grain:
         ----------
         known : (n_view,) bool
             Samples whose noise does not matter.
+        most
+            Of the grainiest, if there are more; all by default.
         """
         if not len(runs):
             return runs
@@ -63,4 +79,7 @@ class Grain:
         size = np.diff(np.append(begin, len(samples)))
         light = np.add.reduceat(mean, begin) / size + OF_ALL * of_all
         noise: F64 = np.sqrt(np.add.reduceat(variance, begin) / size)
-        return runs[noise > LEAST_GRAIN * light]
+        grainy = np.flatnonzero(noise > LEAST_GRAIN * light)
+        if most is not None:
+            grainy = np.sort(grainy[np.argsort(-noise[grainy] / light[grainy], kind="stable")[:most]])
+        return runs[grainy]

@@ -37,7 +37,7 @@ from icheat_usd.lighting.quick import (
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import CloserLook
-from icheat_usd.relight.grain import Grain
+from icheat_usd.relight.grain import Grain, order_of_tiles
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, Bool, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -213,7 +213,7 @@ def build_surroundings(
         count = np.diff(gather.cell_begin)
         chosen = np.random.default_rng(seed).integers(0, count) + gather.cell_begin[:-1]
         cells = prepare_places(snapshot, take_points(gather.patch_points, chosen), albedo[chosen], None)
-        tiles = prepare_places(snapshot, view.points, view.points.albedo, view.to_eye, _tile_order(view))
+        tiles = prepare_places(snapshot, view.points, view.points.albedo, view.to_eye, order_of_tiles(view))
     return Surroundings(
         snapshot,
         tracer,
@@ -231,15 +231,6 @@ def build_surroundings(
         seed,
         sparse,
     )
-
-
-def _tile_order(view: ViewSamples) -> I64:
-    """View samples by tiles of 8 x 8 pixels, within them by quarters of quarters."""
-    y, x = np.divmod(view.pixel.astype(np.int64), view.width)
-    key = (y // 8 * (view.width // 8 + 1) + x // 8) * 64
-    for bit in range(3):
-        key += ((x >> bit & 1) << (2 * bit)) + ((y >> bit & 1) << (2 * bit + 1))
-    return np.argsort(key, kind="stable")
 
 
 def _is_near(position: F32, shining: Shining) -> Bool:
@@ -355,7 +346,7 @@ class MovingLight:
         around = self._around
         assert around.patches is not None and around.tiles is not None
         if self._grain is None:
-            self._cells, self._grain = np.zeros((around.gather.n, 3), np.float32), Grain(around.tiles)
+            self._cells, self._grain = np.zeros((around.gather.n, 3), np.float32), Grain(around.tiles.row)
         turn, at_view = divmod(self._step, 2)
         self._step += 1
         if turn >= self._rounds:
@@ -416,7 +407,7 @@ class MovingLight:
         if self._exposed is None:
             self._is_exposed = _is_near(around.view.points.position, self._shining)
             self._is_exposed[around.smooth] = True
-            self._grainy = np.arange(around.tiles.n_runs, dtype=np.int32)
+            self._grainy = grain.runs
             self._exposed = self._steps_of_exposed(
                 grain.samples(grain.grainy(self._grainy, np.zeros_like(self._is_exposed)))
             )

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from icheat_usd.edits.field import EditField
 from icheat_usd.errors import SampleSetMismatch
-from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight.editing import LitCasters, edit_view
 from icheat_usd.relight.receivers import Receivers, behind_occluders, group_receivers
+from icheat_usd.relight.view_light import light_view
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -93,25 +93,6 @@ def _weighted_sum(per_light: F32, gains: F32 | None) -> F32:
     return sum_lights(per_light if gains is None else per_light * gains[:, None, :])
 
 
-def light_view(
-    snapshot: SceneSnapshot,
-    tracer: Tracer,
-    view: ViewSamples,
-    *,
-    light_samples: int = 16,
-    dome_samples: int | None = None,
-    seed: int = 0,
-    progress: Progress = silent,
-) -> F32:
-    """Direct light that the view samples reflect, (n_lights, n_view, 3); see `build_relighter`."""
-    progress("light the view samples", 0.0)
-    sampler = build_light_sampler(snapshot, tracer, view.points, seed)
-    counts = samples_per_light(snapshot, light_samples, dome_samples)
-    direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, counts)
-    progress("light the view samples", 1.0)
-    return direct
-
-
 def build_relighter(
     snapshot: SceneSnapshot,
     tracer: Tracer,
@@ -129,10 +110,8 @@ def build_relighter(
 
     Parameters
     ----------
-    light_samples : int
-        Shadow rays per light and view sample.
-    dome_samples : int, optional
-        The same for domes; four times `light_samples` by default.
+    light_samples, dome_samples : int
+        See `light_view`.
     """
     direct = light_view(
         snapshot,

@@ -15,7 +15,7 @@ from icheat_usd.lighting import LightSampler, build_light_sampler
 from icheat_usd.lighting.guide import Effort
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight import Relighter
-from icheat_usd.relight.relighter import light_view
+from icheat_usd.relight.view_light import light_view
 from icheat_usd.samples import GatherSamples, ViewSamples, cell_direct, gather_samples, view_samples
 from icheat_usd.samples.gather import pilot_pixels
 from icheat_usd.scene import F32, SceneSnapshot

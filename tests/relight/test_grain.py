@@ -34,7 +34,7 @@ def test_grain_is_that_of_a_plain_loop() -> None:
     # Noise of runs: none, none that shows, just enough to show, much, and as much where it does not matter.
     spread = np.array([0.0, 0.02, 0.287, 0.5, 2.0, 2.0], np.float32)[np.argsort(tiles.row) // RUN]
     rounds = (1 + spread[None, :, None] * (rng.random((ROUNDS, tiles.n, 3)) - 0.5)).astype(np.float32)
-    grain, known = Grain(tiles), np.zeros(tiles.n, np.bool_)
+    grain, known = Grain(tiles.row), np.zeros(tiles.n, np.bool_)
     for found in rounds:
         total = grain.add(found)
     np.testing.assert_allclose(total, rounds.sum(axis=0), rtol=1e-6)
@@ -49,7 +49,7 @@ def test_grain_is_that_of_a_plain_loop() -> None:
     every = np.arange(6, dtype=np.int32)
     assert grain.grainy(every, known).tolist() == expected == [2, 3, 5]
     assert grain.grainy(every[:4], known).tolist() == [2, 3]
-    first = Grain(tiles)
+    first = Grain(tiles.row)
     first.add(rounds[0])
     assert not len(first.grainy(every, known))  # one round says nothing
     # More rounds at one run leave the level of all as it is.
@@ -60,7 +60,7 @@ def test_grain_is_that_of_a_plain_loop() -> None:
 def test_rounds_at_some_runs_leave_the_others_alone() -> None:
     rng = np.random.default_rng(3)
     tiles = places(2 * RUN + 5, rng)
-    grain, found = Grain(tiles), rng.random((tiles.n, 3)).astype(np.float32)
+    grain, found = Grain(tiles.row), rng.random((tiles.n, 3)).astype(np.float32)
     before = grain.add(found).copy()
     samples = grain.samples(np.array([0, 2], np.int32))
     np.testing.assert_array_equal(np.sort(samples), np.sort(np.r_[tiles.row[:RUN], tiles.row[2 * RUN :]]))
