@@ -38,6 +38,7 @@ from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import CloserLook
 from icheat_usd.relight.grain import Grain, order_of_tiles
+from icheat_usd.relight.view_light import look_in_rounds
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, Bool, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -445,7 +446,7 @@ class MovingLight:
 
 
 class AnyLight:
-    """Any kind of light, the general way: part after part of the cells and of the view, shown when all are done."""
+    """Any kind of light, the general way: part after part of the cells and of the view, shown when all had a turn."""
 
     def __init__(
         self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
@@ -456,11 +457,13 @@ class AnyLight:
         self._n_view = samples_per_light(alone, light_samples, dome_samples)[0]
         self._samplers: list[LightSampler] = []
         self._learning: Steps[LightSampler] | None = None
-        self._cell = self._sample = 0
+        self._cell = 0
         self._exact: ExactBounces | None = None
+        self._looks: Iterator[float] | None = None  # at the view
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
-        self._cells = self._view = np.empty((0, 3), np.float32)  # from the first step on
+        self._cells = np.empty((0, 3), np.float32)  # from the first step on
+        self._view = np.empty((1, 0, 3), np.float32)  # from the first look at it on
         self.following: Following | None = None  #: set from before to spare work
 
     def show(self, radiance: F32, view_direct: F32) -> None:
@@ -490,7 +493,7 @@ class AnyLight:
         """The next part of the cells, then of the view; False after the last."""
         around = self._around
         if not len(self._cells):
-            self._cells, self._view = (np.zeros((n, 3), np.float32) for n in (around.gather.n, around.view.n))
+            self._cells = np.zeros((around.gather.n, 3), np.float32)
         if self._cell < around.gather.n:
             if self._samplers:
                 self._light_cells()
@@ -501,14 +504,19 @@ class AnyLight:
         if self._exact.step(radiance):
             return True
         self.direct = self._cells
-        if self._sample < around.view.n and len(self._samplers) < 2:
+        if not around.view.n:
+            return False
+        if len(self._samplers) < 2:
             self._learn()
-        elif self._sample < around.view.n:
-            self._light_view()
-        if self._sample < around.view.n:
             return True
-        view_direct[:] = self._view
-        return False
+        if self._looks is None:
+            # Of its own, as that of all lights is another when one comes or goes.
+            self._view = view_direct[None].copy()
+            scene = self._alone, around.tracer, self._samplers[1], around.view
+            self._looks = look_in_rounds(*scene, self._seed, [self._n_view], self._view)
+        is_left = next(self._looks, None) is not None
+        view_direct[:] = self._view[0]
+        return is_left
 
     def restart_bounces(self) -> None:
         """Bounces are to be solved with other rows."""
@@ -540,10 +548,3 @@ class AnyLight:
         cells, seed = np.arange(first, last), int(hash_combine(self._seed, first)) & 0x7FFFFFFF
         self._cells[first:last] = around.lit_cells(self._alone, self._sampler(0), cells, seed, self._n_cells)
         self._cell = last
-
-    def _light_view(self) -> None:
-        around, first = self._around, self._sample
-        last = min(first + max(1, _RAYS_PER_STEP // self._n_view), around.view.n)
-        samples, seed = np.arange(first, last), int(hash_combine(self._seed, first)) & 0x7FFFFFFF
-        self._view[first:last] = around.lit_view(self._alone, self._sampler(1), samples, seed, self._n_view)
-        self._sample = last

@@ -1,15 +1,17 @@
-"""Direct light that a view reflects under lights that stay: shadow rays in rounds, more of them where they would show."""
+"""Direct light that a view reflects under lights that stay: shadow rays in rounds, more where noise would show."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
-from icheat_usd.lighting import build_light_sampler, reflected_direct, samples_per_light
+from icheat_usd.lighting import LightSampler, build_light_sampler, reflected_direct, samples_per_light
 from icheat_usd.materials import take_points
 from icheat_usd.progress import Progress, silent
 from icheat_usd.relight.grain import Grain, order_of_tiles
 from icheat_usd.samples import ViewSamples
-from icheat_usd.scene import F32, I64, SceneSnapshot
+from icheat_usd.scene import F32, SceneSnapshot
 from icheat_usd.tracing import Tracer
 
 #: Rounds that all view samples have, whose differences tell of noise; and those at what is grainy.
@@ -17,6 +19,7 @@ ROUNDS, ROUNDS_AT_GRAIN = 4, 16
 #: Of the view samples, that are taken for grainy at most: as many rays again.
 MOST_GRAINY = 1 / 3
 _NAME = "light the view samples"
+_RAYS_PER_STEP = 1 << 16
 
 
 def light_view(
@@ -47,34 +50,54 @@ def light_view(
     progress(_NAME, 0.0)
     sampler = build_light_sampler(snapshot, tracer, view.points, seed)
     counts = samples_per_light(snapshot, light_samples, dome_samples)
-    if min(counts, default=0) < ROUNDS:
-        direct = reflected_direct(snapshot, tracer, sampler, view.points, view.to_eye, seed, counts)
-        progress(_NAME, 1.0)
-        return direct
-    of_round = [-(-count // ROUNDS) for count in counts]
+    out = np.empty((len(counts), view.n, 3), np.float32)
+    for done in look_in_rounds(snapshot, tracer, sampler, view, seed, counts, out):
+        progress(_NAME, done)
+    progress(_NAME, 1.0)
+    return out
 
-    def look(samples: I64, turn: int) -> F32:
-        """What a round brings to some samples, by the next rays of each one's sequence."""
-        points, eye = take_points(view.points, samples), view.to_eye[samples]
-        sequence = np.stack([samples, np.full_like(samples, turn)], axis=1)
-        return reflected_direct(snapshot, tracer, sampler, points, eye, seed, of_round, sequence)
 
-    every = np.arange(view.n)
-    grain, total, n_rounds = Grain(order_of_tiles(view)), np.zeros((len(counts), view.n, 3), np.float32), 0 * every
-    samples, runs = every, grain.runs
-    for turn in range(ROUNDS_AT_GRAIN):
+def look_in_rounds(
+    snapshot: SceneSnapshot,
+    tracer: Tracer,
+    sampler: LightSampler,
+    view: ViewSamples,
+    seed: int,
+    counts: Sequence[int],
+    out: F32,
+) -> Iterator[float]:
+    """`light_view` in steps of some tens of milliseconds, each of which says how much is done.
+
+    Parameters
+    ----------
+    counts : (n_lights,)
+        Shadow rays of each light.
+    out : (n_lights, n_view, 3)
+        Receives what is found: at the end, and before more is looked at where that is grainy.
+    """
+    is_in_rounds = min(counts, default=0) >= ROUNDS
+    of_round = [-(-count // ROUNDS) for count in counts] if is_in_rounds else counts
+    at_once = max(_RAYS_PER_STEP // max(sum(of_round), 1), 1)
+    n_rounds = np.zeros(view.n, np.float32)
+    grain, total = Grain(order_of_tiles(view)), np.zeros((len(counts), view.n, 3), np.float32)
+    samples, runs = np.arange(view.n), grain.runs
+    for turn in range(ROUNDS_AT_GRAIN if is_in_rounds else 1):
         if turn in (ROUNDS, 2 * ROUNDS):
+            np.divide(total, n_rounds[:, None], out=out)
             runs = grain.grainy(runs, np.zeros(view.n, np.bool_), int(MOST_GRAINY * len(grain.runs)))
             samples = grain.samples(runs)
         if not len(samples):
             break
-        found = look(samples, turn)
-        total[:, samples] += found
+        found = np.zeros((view.n, 3), np.float32)
+        for first in range(0, len(samples), at_once):
+            some = samples[first : first + at_once]
+            # The next rays of each one's sequence.
+            sequence = np.stack([some, np.full_like(some, turn)], axis=1)
+            points, eye = take_points(view.points, some), view.to_eye[some]
+            of_lights = reflected_direct(snapshot, tracer, sampler, points, eye, seed, of_round, sequence)
+            total[:, some] += of_lights
+            found[some] = of_lights.sum(axis=0)
+            yield (turn + (first + len(some)) / len(samples)) / ROUNDS_AT_GRAIN
+        grain.add(found, samples)
         n_rounds[samples] += 1
-        of_all = np.zeros((view.n, 3), np.float32)
-        of_all[samples] = found.sum(axis=0)
-        grain.add(of_all, samples)
-        progress(_NAME, (turn + 1) / ROUNDS_AT_GRAIN)
-    progress(_NAME, 1.0)
-    total /= n_rounds[:, None].astype(np.float32)
-    return total
+    np.divide(total, n_rounds[:, None], out=out)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+
 import numba
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from icheat_usd.lighting import build_light_sampler, reflected_direct
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.relight import view_light
 from icheat_usd.relight.grain import order_of_tiles
+from icheat_usd.relight.lights import LiveLights
 from icheat_usd.relight.view_light import ROUNDS, light_view
 from icheat_usd.scene import F32, LightKind
 from tests.pipeline import Pipeline
@@ -92,3 +95,46 @@ def test_same_bits_for_any_number_of_threads(room: Pipeline):
 def test_a_scene_without_lights_is_dark(room: Pipeline):
     snapshot = make_snapshot(cornell_meshes(), lights=[], camera=room.snapshot.camera)
     assert light_view(snapshot, room.tracer, room.view).shape == (0, room.view.n, 3)
+
+
+@pytest.fixture(scope="module")
+def under_sky() -> Pipeline:
+    """A room without a ceiling, in which walls have soft borders of shadow."""
+    camera = look_at((0, 0, 3.9), fov=39.3, width=96, height=72)
+    open_room = [mesh for mesh in cornell_meshes() if mesh.path != "/ceiling"]
+    block = Mesh(box(0.35, (0.2, -0.3, 0.1)), Material(0.7), path="/block")
+    sky = Light(LightKind.DOME, (0.5, 0.6, 0.9), path="/sky")
+    return Pipeline(make_snapshot([*open_room, block], lights=[sky], camera=camera), n_gather=100, bounce_rays=16)
+
+
+def live(of: Pipeline) -> LiveLights:
+    return LiveLights(of.snapshot, of.tracer, of.view, of.gather, of.bounces, n_bounces=1, light_samples=4, seed=3)
+
+
+def test_a_live_dome_comes_to_rest_as_a_still_view_is_lit_and_shows_what_all_samples_had_before(under_sky: Pipeline):
+    seed = (3 + zlib.crc32(b"/sky")) & 0x7FFFFFFF
+    parts = under_sky.snapshot, under_sky.tracer, under_sky.view
+    expected = light_view(*parts, light_samples=4, seed=seed)
+    points, eye = under_sky.view.points, under_sky.view.to_eye
+    one_look = reflected_direct(*parts[:2], build_light_sampler(*parts[:2], points, seed), points, eye, seed, [4 * 4])
+    assert 0.02 < (~np.isclose(expected, one_look, rtol=1e-4, atol=1e-6)).any(axis=(0, 2)).mean() < 0.4
+    lights = live(under_sky)
+    shown = []
+    while lights.refine():
+        shown.append(np.allclose(lights.view_direct, one_look, rtol=1e-4, atol=1e-6))
+    assert any(shown)
+    np.testing.assert_array_equal(lights.view_direct, expected)
+
+
+def test_a_light_that_comes_while_a_dome_is_looked_at_changes_nothing_of_it(under_sky: Pipeline):
+    alone = live(under_sky)
+    while alone.refine():
+        pass
+    lights, n_steps = live(under_sky), 0
+    while lights.refine():
+        n_steps += 1
+        if n_steps % 3 == 0 and n_steps < 40:
+            here = translation(0, 0.1 * n_steps / 40, 0)[:3]
+            lights.add(f"/more_{n_steps}", LightKind.SPHERE, to_world=here, radiance=(1, 1, 1), size=(0.1, 0))
+    assert len(lights.paths) > 3
+    np.testing.assert_array_equal(lights.view_direct[0], alone.view_direct[0])
