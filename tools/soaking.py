@@ -2,7 +2,8 @@
 
 Memory is flat when it is not larger in the last quarter of the time than in the second: the first one fills what is
 bounded (the frames in memory, the steps that can be undone) and is left out. Before it starts, every frame is visited,
-as each takes memory of its own for as long as there is room for it.
+as each takes memory of its own for as long as there is room for it. At each look what is freed is given back first, which
+a session does every few seconds: else what is looked at goes with the pace of the commands.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from icheat_usd.errors import IcheatError
+from icheat_usd.freed_memory import give_freed_memory_back
 from icheat_usd.scene import LightKind
 from icheat_usd.session import LiveSession
 
@@ -105,6 +107,7 @@ def soak(
         now = time.monotonic()
         if now - looked >= every:
             looked = now
+            give_freed_memory_back()
             found.memory.append((now - began, resident_bytes()))
             found.pace.append((now - began, total))
             say(f"{now - began:7.0f} s  {total:9,} commands  {found.memory[-1][1] / 2**20:8.1f} MiB")
