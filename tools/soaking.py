@@ -2,8 +2,8 @@
 
 Memory is flat when it is not larger in the last quarter of the time than in the second: the first one fills what is
 bounded (the frames in memory, the steps that can be undone) and is left out. Before it starts, every frame is visited,
-as each takes memory of its own for as long as there is room for it. At each look what is freed is given back first, which
-a session does every few seconds: else what is looked at goes with the pace of the commands.
+as each takes memory of its own for as long as there is room for it. Before each look what was freed is given back,
+which a session does every few seconds: else what is looked at would go with the pace of the commands.
 """
 
 from __future__ import annotations
