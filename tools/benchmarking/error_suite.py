@@ -40,6 +40,8 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
     lights = choose_lights(parts.snapshot, parts.tracer, parts.view, SETS[case["lights"]])
     under = parts.under(with_lights(parts.snapshot, lights))
     settings = QUICK if quick else ErrorSettings()
+    if case.get("pixels"):
+        settings = settings.of_pixels(case["pixels"])
     if case["quality"] == "LIVE_FINE":  # what does not depend on the mode is measured once
         settings = replace(settings, hit_pixels=0, tolerances=(), shares=())
     found = measure_errors(under, settings, folder / case["quality"])

@@ -58,6 +58,11 @@ class ErrorSettings:
     shares: tuple[float, ...] = (0.05, 0.1)  #: of the view samples that rows are kept at, for another such curve
     seed: int = 20_061
 
+    def of_pixels(self, n: int) -> ErrorSettings:
+        """The same with so many pixels, and as many of them measured again as there are to their number."""
+        noisy = max(1, round(self.noisy_pixels * n / self.pixels))
+        return replace(self, pixels=n, record_pixels=n, noisy_pixels=noisy)
+
 
 @dataclass(frozen=True)
 class References:

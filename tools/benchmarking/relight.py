@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lights", choices=_LIGHT_SETS, default="first", help="errors: which test lights; second is for reports alone"
     )
+    parser.add_argument("--pixels", type=int, help="errors: how many are measured, spread over the image; default 2000")
     parser.add_argument(
         "--mixed", action="store_true", help="frames: also 64 edits of which some turn hues; takes minutes"
     )
@@ -55,4 +56,5 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.quality or arguments.quick:
         effort["quality"] = arguments.quality or _QUALITIES[0]
     options = {"minutes": arguments.minutes, "lights": arguments.lights, "mixed": arguments.mixed}
+    options["pixels"] = arguments.pixels
     return run_benchmark(BENCHMARK, arguments, stages, effort, options)
