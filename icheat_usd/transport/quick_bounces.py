@@ -12,11 +12,13 @@ from icheat_usd.kernels.workers import take_back
 from icheat_usd.samples import ClusterTree
 from icheat_usd.scene import F32, I64
 from icheat_usd.transport.bounces import Bounces
+from icheat_usd.transport.sparse import SparseRows
 
 _CLUSTERS = 1024  # at most: their matrices take 12 MB
 _FEW_CLUSTERS = 256  # whose bounces add up in some hundredths of a second
 _CELLS_PER_CLUSTER = 32  # where there are more clusters than that
 _STEPS = 2  # at most, per change
+_FIRST_STEPS = 3  # of light from nothing: what is caught between white surfaces is most of a pixel's, and comes last
 _ALL = (0, 1)  # every cell
 
 _WHITE, _WHITE_COUNTS = 0.9, 8  # cells of a larger albedo stand for so many
@@ -80,7 +82,7 @@ class QuickBounces:
             return out
         # Nothing grows in so few steps.
         self._add(leaves, None, _ALL, 1.0, none)
-        return self._balance(direct, _ALL, 1.0, out)
+        return self._balance(direct, _ALL, 1.0, out, _FIRST_STEPS, 0.0)
 
     def follow(
         self, radiance: F32, before: F32, direct: F32, out: F32 | None = None, part: tuple[int, int] = (0, 1)
@@ -102,12 +104,14 @@ class QuickBounces:
         if changed > all_of_it:
             return self.solve(direct, out)
         self._add(leaves, None, _ALL, self.sent_on, np.empty((0, 3), np.float32))
-        return self._balance(direct, part, self.sent_on, out)
+        return self._balance(direct, part, self.sent_on, out, _STEPS, _UNBALANCED)
 
-    def _balance(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32) -> F32:
-        for _ in range(_STEPS):
+    def _balance(
+        self, direct: F32, part: tuple[int, int], sent_on: float, out: F32, most_steps: int, unbalanced: float
+    ) -> F32:
+        for _ in range(most_steps):
             lacking, light = self._step(direct, part, sent_on, out)
-            if lacking <= _UNBALANCED * light:
+            if lacking <= unbalanced * light:
                 break
             part = _ALL if lacking > _FAR * light else ((part[0] + part[1] // 2) % part[1], part[1])
         return out
@@ -171,7 +175,7 @@ def build_quick_bounces(
         Diffuse reflections before the last one, as for `solve_bounces`; at least 2.
     """
     rows, lasting = bounces.few, n_bounces >= _LASTING
-    albedo = lasting_albedo(bounces.albedo, n_bounces) if lasting else bounces.albedo
+    albedo = lasting_albedo(rows, bounces.albedo, n_bounces) if lasting else bounces.albedo
     bits = max(1, int(tree.n_leaves - 1).bit_length())
     entries = np.empty(rows.n_entries, np.uint32)
     kernels.shorten(rows.indices, rows.weights, bits, entries)
@@ -225,14 +229,20 @@ def _growth(quick: QuickBounces) -> float:
     return float((after / before) ** (1 / _LAST_TRIED)) if before > 0 else 0.0
 
 
-def lasting_albedo(albedo: F32, n_bounces: int) -> F32:
-    """Albedo whose balance among surfaces of one albedo has the light of so many bounces.
+def lasting_albedo(rows: SparseRows, albedo: F32, n_bounces: int) -> F32:
+    """Albedo whose balance is the light of so many bounces, where all cells send as much at first.
 
-    ``1 / (1 - a')`` is ``1 + a + ... + a^(n - 1)``. White surfaces, which would keep light for ever, lose a little
-    at every bounce.
+    With v that light, of n bounces, ``v = 1 + A R v'`` and v' that of one less; so ``v = 1 + A' R v`` where
+    ``A' = A (R v') / (R v)``. Light that soon finds its way out keeps its albedo, and where it lasts, as between white
+    surfaces, each bounce loses a little. Other light than v has no more of it for ever either: ``A' R v <= (1 - 1 / max
+    v) v``, by which no error is kept (the bound of Collatz and Wielandt; Horn and Johnson 2013, Matrix Analysis,
+    section 8.1).
     """
-    a = albedo.astype(np.float64)[..., None] ** np.arange(n_bounces)
-    return (1.0 - 1.0 / a.sum(axis=-1)).astype(np.float32)
+    light, arriving = np.ones_like(albedo), np.zeros_like(albedo)
+    for _ in range(n_bounces - 1):
+        arriving = rows.matmul(light)
+        light = 1 + albedo * arriving
+    return np.asarray(albedo * arriving / np.maximum(rows.matmul(light), np.finfo(np.float32).tiny))
 
 
 def _all_bounces(factors: F32, albedo: F32, n: int) -> F32:

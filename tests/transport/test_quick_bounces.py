@@ -60,7 +60,7 @@ def test_more_clusters_come_closer_to_the_light_of_the_view(room: Pipeline) -> N
 
 def _balance(bounces: Bounces, direct: np.ndarray) -> np.ndarray:
     """What 16 bounces are taken to balance at, by many plain ones."""
-    lasting = replace(bounces, albedo=lasting_albedo(bounces.albedo, 16))
+    lasting = replace(bounces, albedo=lasting_albedo(bounces.few, bounces.albedo, 16))
     return solve_bounces(lasting, direct[None], 200)[0]
 
 
@@ -102,8 +102,85 @@ def test_bounces_of_a_part_of_the_cells_come_as_close_within_a_round(room: Pipel
 @pytest.mark.parametrize("albedo", [0.0, 0.3, 0.8, 0.99, 1.0])
 def test_a_balance_has_the_light_of_so_many_bounces(albedo: float) -> None:
     """Between surfaces of one albedo, whose rows add up to 1."""
-    lasting = float(lasting_albedo(np.full((1, 3), albedo, np.float32), 16)[0, 0])
-    assert 1 / (1 - lasting) == pytest.approx(sum(albedo**k for k in range(16)), rel=1e-5)
+    n = 5
+    rows = SparseRows(
+        np.arange(n + 1, dtype=np.int64) * n, np.tile(np.arange(n), n).astype(np.int32), _even(n * n, n), n
+    )
+    for lasting in lasting_albedo(rows, np.full((n, 3), albedo, np.float32), 16).ravel():
+        assert 1 / (1 - lasting) == pytest.approx(sum(albedo**k for k in range(16)), rel=1e-5)
+
+
+def _even(n_entries: int, each: int) -> np.ndarray:
+    return np.full(n_entries, 1 / each, np.float32)
+
+
+def _leaky(rng: np.random.Generator, n: int) -> tuple[np.ndarray, SparseRows, np.ndarray]:
+    """Dense and sparse rows of which half the light gets lost, but that of a few white cells, and the albedo."""
+    dense = rng.random((n, n)) * (rng.random((n, n)) < 0.4)
+    dense *= rng.uniform(0.3, 0.7, (n, 1)) / dense.sum(axis=1, keepdims=True)
+    dense[:4], dense[4:, :4] = 0, 0
+    dense[:4, :4] = 1 / 4
+    albedo = rng.uniform(0, 0.9, (n, 3))
+    albedo[:4] = 1
+    cell, seen = np.nonzero(dense)
+    indptr = np.searchsorted(cell, np.arange(n + 1)).astype(np.int64)
+    weights = dense[cell, seen].astype(np.float32)
+    return dense, SparseRows(indptr, seen.astype(np.int32), weights, n), albedo.astype(np.float32)
+
+
+def test_of_even_light_the_balance_is_exactly_that_of_the_bounces() -> None:
+    """Beside dense algebra; where light is lost soon, nearly all of the albedo is kept."""
+    dense, rows, albedo = _leaky(np.random.default_rng(4), 40)
+    lasting = lasting_albedo(rows, albedo, 16)
+    for channel in range(3):
+        bounce = albedo[:, channel, None] * dense
+        light = sum(np.linalg.matrix_power(bounce, k) @ np.ones(40) for k in range(16))
+        balance = np.linalg.solve(np.eye(40) - lasting[:, channel, None] * dense, np.ones(40))
+        np.testing.assert_allclose(balance, light, rtol=1e-4)
+        # No light, and no error, shrinks by less than this in a bounce.
+        assert np.abs(np.linalg.eigvals(lasting[:, channel, None] * dense)).max() < 1 - 1 / light.max() + 1e-5
+    np.testing.assert_allclose(lasting[:4], 15 / 16, rtol=1e-4)
+    shows = albedo[4:] > 0.1
+    assert (lasting[4:][shows] > 0.97 * albedo[4:][shows]).all()
+
+
+def test_cells_that_receive_nothing_send_nothing_on() -> None:
+    rows = SparseRows(np.array([0, 0, 1], np.int64), np.array([0], np.int32), np.ones(1, np.float32), 2)
+    lasting = lasting_albedo(rows, np.ones((2, 3), np.float32), 16)
+    np.testing.assert_array_equal(lasting, [[0, 0, 0], [1, 1, 1]])
+
+
+def test_light_from_nothing_comes_close_in_a_trap_of_white_surfaces() -> None:
+    """A lampshade: of its light a fifth gets out at every bounce."""
+    n, caught = 512, 16
+    rng = np.random.default_rng(6)
+    dense = np.zeros((n, n))
+    dense[:, caught:] = rng.random((n, n - caught)) * (rng.random((n, n - caught)) < 0.1)
+    dense[:caught] *= 0.2 / dense[:caught].sum(axis=1, keepdims=True)
+    dense[caught:] *= 0.5 / dense[caught:].sum(axis=1, keepdims=True)
+    pairs = rng.permutation(caught)
+    dense[np.arange(caught), pairs] += 0.8
+    cell, seen = np.nonzero(dense)
+    rows = SparseRows(
+        np.searchsorted(cell, np.arange(n + 1)).astype(np.int64),
+        seen.astype(np.int32),
+        dense[cell, seen].astype(np.float32),
+        n,
+    )
+    albedo = np.full((n, 3), 0.5, np.float32)
+    albedo[:caught] = 1
+    bounces = Bounces(rows, albedo, rows)
+    tree = SimpleNamespace(n_leaves=n, weight=np.ones(n))
+    begin = np.append(np.arange(0, n, caught), n)
+    direct = np.zeros((n, 3), np.float32)
+    direct[:caught] = rng.random((caught, 1))
+    exact = solve_bounces(bounces, direct[None], 16)[0]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_clusters", lambda *_: begin)
+        quick = build_quick_bounces(bounces, tree, 16)  # type: ignore[arg-type]
+    off = np.abs(quick.solve(direct) - exact).sum() / exact.sum()
+    # With a step less it is 5 % off, and with white surfaces that all lose as much 18 %.
+    assert off < 0.045
 
 
 @pytest.mark.parametrize(("n_sheets", "each"), [(64, 8), (16, 16)])
