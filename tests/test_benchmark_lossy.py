@@ -11,6 +11,7 @@ from icheat_usd.transport.packed import PackedLobe, PackedRows
 from tests.pipeline import Pipeline
 from tests.scenes import cornell
 from tools.benchmarking.converged import Probe, converged_products, lossy_errors, samples_of_noisy_pixels
+from tools.benchmarking.errors import ErrorSettings
 
 N_RAYS = 4096
 
@@ -99,3 +100,10 @@ def test_noisy_pixels_are_those_with_most_noise_under_any_light() -> None:
     halves[1, 1, 63] += 0.1  # and one of pixel 31 under the second, which is less bright
     noisy = samples_of_noisy_pixels(probe, (np.stack([error, error]), halves), 2)
     np.testing.assert_array_equal(noisy, [6, 7, 62, 63])
+
+
+def test_more_pixels_have_as_many_again_that_are_measured_twice() -> None:
+    settings = ErrorSettings(pixels=2000, noisy_pixels=100, rays=7)
+    more = settings.of_pixels(6000)
+    assert (more.pixels, more.record_pixels, more.noisy_pixels, more.rays) == (6000, 6000, 300, 7)
+    assert settings.of_pixels(3).noisy_pixels == 1

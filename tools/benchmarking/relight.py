@@ -55,6 +55,5 @@ def run(arguments: argparse.Namespace) -> int:
         effort = {"width": 32, "height": 24, "n_gather": 512}
     if arguments.quality or arguments.quick:
         effort["quality"] = arguments.quality or _QUALITIES[0]
-    options = {"minutes": arguments.minutes, "lights": arguments.lights, "mixed": arguments.mixed}
-    options["pixels"] = arguments.pixels
+    options = {name: getattr(arguments, name) for name in ("minutes", "lights", "pixels", "mixed")}
     return run_benchmark(BENCHMARK, arguments, stages, effort, options)
