@@ -42,7 +42,7 @@ def test_every_suite_reports(tmp_path: Path) -> None:
     lights = results["errors"][0]["lights"]
     assert lights.keys() >= {"spot", "grazing"}
     for light in lights.values():
-        assert {"total", "at_rest", "packing", "interpolation_and_packing", "lossy_at_rest", "what"} <= light.keys()
+        assert {"total", "at_rest", "dragged", "packing", "lossy_dragged", "lossy_at_rest", "what"} <= light.keys()
     assert all(edit["of_unedited"] > 0 for edit in results["errors"][0]["edits"].values())
     assert [(point["by"], point["setting"]) for point in results["errors"][0]["curve"]] == [
         ("tolerance of packing", 0.1), ("tolerance of packing", 0.02), ("share of samples with rows", 0.3)

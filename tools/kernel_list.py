@@ -83,6 +83,9 @@ def _change_a_little() -> None:
             live.film()
             live.set_light(light, gain=0.4)
             live.frame()
+            # What is known of a light at rest when it moves on.
+            live.set_light(light, move=(0.02, 0.0, 0.0))
+            live.frame()
 
 
 def _live_stages() -> Iterator[Path]:

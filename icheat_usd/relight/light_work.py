@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -38,7 +38,8 @@ from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import CloserLook
 from icheat_usd.relight.grain import Grain, order_of_tiles
-from icheat_usd.relight.view_light import look_in_rounds
+from icheat_usd.relight.known_noise import KnownNoise
+from icheat_usd.relight.view_light import ROUNDS, ROUNDS_AT_GRAIN, look_in_rounds
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, Bool, LightKind, SceneSnapshot
 from icheat_usd.tracing import Tracer
@@ -59,6 +60,12 @@ _NEAR = 1.0
 
 # So many times the rounds at grainy view samples: those at borders of shadows.
 _MORE = 4
+
+# Rounds from which on a light is known well enough to tell what is noise in a look at it.
+_KNOWN_ROUNDS = 4
+
+# Noise of runs of cells and of view samples, beside their light, below which it is left: of what moves less is seen.
+_LEAST_AT_CELLS, _LEAST_AT_VIEW = 0.01, 0.03
 
 # Rays to the sky of each patch point and view sample, for domes on the move.
 _SKY_OF_CELLS, _SKY_OF_VIEW = 16, 8
@@ -266,6 +273,8 @@ class ExactBounces:
 class KnownLight:
     """A light at rest whose bounces alone are solved anew."""
 
+    is_known = True
+
     def __init__(self, around: Surroundings, direct: F32) -> None:
         self._around, self.direct = around, direct
         self._exact = ExactBounces(around, direct)
@@ -284,6 +293,7 @@ class Following:
 
     def __init__(self, around: Surroundings) -> None:
         self.n = 0  #: first looks so far
+        self._noise: tuple[KnownNoise, KnownNoise] | None = None  # of first looks at cells and at view samples
         self.cells = None if around.cells is None else LastLook(around.cells)
         self.view = None if around.tiles is None else LastLook(around.tiles)
         self.patches = None if around.patches is None else CloserLook(around.patches, around.gather)
@@ -292,6 +302,25 @@ class Following:
         """Of the cells, whose bounces are looked at this time; all of them at first."""
         self.n += 1
         return (0, 1) if self.n == 1 else (self.n % PARTS, PARTS)
+
+    def know(self, around: Surroundings, look: tuple[F32, F32], known: tuple[F32, F32]) -> None:
+        """Take from later first looks what is noise in one, at cells and at view samples, by what is known there."""
+        assert around.tiles is not None
+        every = np.arange(around.gather.n, dtype=np.int32)
+        self._noise = (
+            KnownNoise(every, look[0], known[0], least=_LEAST_AT_CELLS, smooths=False),
+            KnownNoise(around.tiles.row, look[1], known[1], least=_LEAST_AT_VIEW, smooths=True),
+        )
+
+    def clean_cells(self, direct: F32) -> None:
+        """Take known noise from a first look at the cells."""
+        if self._noise is not None:
+            self._noise[0].take_from(direct)
+
+    def clean_view(self, view_direct: F32) -> None:
+        """The same for the view samples."""
+        if self._noise is not None:
+            self._noise[1].take_from(view_direct)
 
 
 class MovingLight:
@@ -319,28 +348,56 @@ class MovingLight:
         self._cells = np.empty((0, 3), np.float32)  # from the first step on
         self._grain: Grain | None = None  # the same
 
-    def show(self, radiance: F32, view_direct: F32) -> None:
+    @property
+    def is_known(self) -> bool:
+        """Whether enough rounds were made for `show` to know noise by what they found."""
+        return self._step >= 2 * min(_KNOWN_ROUNDS, self._rounds)
+
+    def show(self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None) -> None:
         """First look: a shadow ray per cell, more where that leaves noise, and one per view sample at shadows' edges.
 
         Near the look before, a part of these rays is enough.
+
+        Parameters
+        ----------
+        known : SceneSnapshot, optional
+            The light as it was when many rays found `self.direct` and `view_direct`: noise of a look there is taken
+            from looks from now on.
         """
         around = self._around
         self.following = last = self.following or Following(around)
+        if known is not None and self.direct is not None:
+            look = np.empty_like(self.direct), np.empty_like(view_direct)
+            MovingLight(around, known, self._seed, self._rounds, None)._look(last, *look)
+            last.know(around, look, (self.direct, view_direct))
+        direct = np.empty((around.gather.n, 3), np.float32)
+
+        def bounce() -> None:
+            last.clean_cells(direct)
+            around.bounce(direct, radiance, self.direct, last.next_part())
+
+        self._look(last, direct, view_direct, bounce)
+        last.clean_view(view_direct)
+        self.direct = direct
+
+    def _look(
+        self, last: Following, direct: F32, view_direct: F32, at_cells: Callable[[], None] = lambda: None
+    ) -> None:
+        """A few rays to each place; `at_cells` is called once `direct` is found, beside the look at the view."""
+        around = self._around
         assert around.cells is not None and around.tiles is not None
         assert last.cells is not None and last.patches is not None
-        direct = np.empty((around.gather.n, 3), np.float32)
         shadows = around.shadows_of(self._alone)
         told = look_and_tell(self._alone, shadows, around.cells, self._seed, direct, last.cells, self._shining)
         tiles, closer = around.tiles, last.patches
         look = Look(self._alone, shadows, tiles, self._shining, self._seed, True, view_direct, 0, last.view, told)
 
-        def bounce() -> None:
+        def work() -> None:
             closer.improve(self._alone, shadows, self._seed, self._shining, direct, told)
-            around.bounce(direct, radiance, self.direct, last.next_part())
+            at_cells()
 
-        beside(bounce, look.pieces())
+        beside(work, look.pieces())
         look.finish()
-        self.direct = direct
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """Another round at the cells or at the view; False after the last."""
@@ -460,25 +517,32 @@ class AnyLight:
         self._cell = 0
         self._exact: ExactBounces | None = None
         self._looks: Iterator[float] | None = None  # at the view
+        self.is_known = False  #: whether enough rounds were made for `show` to know noise by what they found
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
         self._cells = np.empty((0, 3), np.float32)  # from the first step on
         self._view = np.empty((1, 0, 3), np.float32)  # from the first look at it on
         self.following: Following | None = None  #: set from before to spare work
 
-    def show(self, radiance: F32, view_direct: F32) -> None:
-        """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample."""
+    def show(self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None) -> None:
+        """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample.
+
+        `known` is that of `MovingLight.show`, for domes.
+        """
         around = self._around
         if around.shadows is not None and self._alone.lights.kind[0] == LightKind.DOME:
-            of_cells = around.sky(self._alone)[0]
             self.bins = self.bins or BinnedSky(self._alone)
-            sky = self.bins.under(self._alone)
+            self.following = last = self.following or Following(around)
+            if known is not None and self.direct is not None:
+                look = np.empty_like(self.direct), np.empty_like(view_direct)
+                self._look_at_sky(known, *look)
+                last.know(around, look, (self.direct, view_direct))
             direct = np.empty((around.gather.n, 3), np.float32)
-            of_cells.light(sky, direct, self._alone.controls(0))
-            self.following = self.following or Following(around)
-            around.bounce(direct, radiance, self.direct, self.following.next_part())
+            self._look_at_sky(self._alone, direct, view_direct)
+            last.clean_cells(direct)
+            around.bounce(direct, radiance, self.direct, last.next_part())
             self.direct = direct
-            around.light_view(self._alone, sky, view_direct)
+            last.clean_view(view_direct)
             return
         patch = around.gather.cell_begin[:-1]
         points = take_points(around.gather.patch_points, patch)
@@ -488,6 +552,13 @@ class AnyLight:
         view_direct[:] = reflected_direct(
             self._alone, around.tracer, self._sampler(1), around.view.points, around.view.to_eye, self._seed, 1
         )[0]
+
+    def _look_at_sky(self, alone: SceneSnapshot, direct: F32, view_direct: F32) -> None:
+        """Light of a dome at cells and view samples, by what they see of the sky."""
+        assert self.bins is not None
+        around, sky = self._around, self.bins.under(alone)
+        around.sky(alone)[0].light(sky, direct, alone.controls(0))
+        around.light_view(alone, sky, view_direct)
 
     def step(self, radiance: F32, view_direct: F32) -> bool:
         """The next part of the cells, then of the view; False after the last."""
@@ -514,9 +585,11 @@ class AnyLight:
             self._view = view_direct[None].copy()
             scene = self._alone, around.tracer, self._samplers[1], around.view
             self._looks = look_in_rounds(*scene, self._seed, [self._n_view], self._view)
-        is_left = next(self._looks, None) is not None
+        done = next(self._looks, None)
         view_direct[:] = self._view[0]
-        return is_left
+        # What the first rounds found is there once more are made where it is grainy.
+        self.is_known = done is None or done > ROUNDS / ROUNDS_AT_GRAIN
+        return done is not None
 
     def restart_bounces(self) -> None:
         """Bounces are to be solved with other rows."""

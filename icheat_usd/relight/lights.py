@@ -49,9 +49,9 @@ class _Light:
 class LiveLights:
     """Light of every light at gathers and view, kept per light so that one light's change costs one light.
 
-    A change shows at once, with a shadow ray for every cell and some view samples; `refine` brings it in
-    steps to the quality of `light_cells` and `reflected_direct`. What is reached then depends on the light
-    alone, not on how it got there.
+    A change shows at once, with a shadow ray for every cell and some view samples, less the noise that is known of
+    these rays from where the light was at rest; `refine` brings it in steps to the quality of `light_cells` and
+    `reflected_direct`. What is reached then depends on the light alone, not on how it got there.
 
     Parameters
     ----------
@@ -166,13 +166,15 @@ class LiveLights:
             A value does not fit the light, or the light is a mesh, whose place is geometry.
         """
         state = self._lights[self._checked(light)]
+        is_known = texture is None and (state.work is None or state.work.is_known)
+        known = state.alone if is_known else None
         state.alone = changed_light(
             self._images, state.alone, to_world=to_world, radiance=radiance, size=size, texture=texture
         )
         if texture is not None:
             state.bins = None
             state.image = self._number(texture)
-        self._show(light)
+        self._show(light, known)
 
     def add(
         self,
@@ -233,7 +235,8 @@ class LiveLights:
             raise LightError(f"there is no light {light}; the scene has {len(self._lights)}")
         return light
 
-    def _show(self, light: int) -> None:
+    def _show(self, light: int, known: SceneSnapshot | None = None) -> None:
+        """First look; `known` is the light as it was, if what it brings is known well."""
         state = self._lights[light]
         # By name, not by number: a light keeps its random numbers when others come or go.
         seed = (self._seed + zlib.crc32(state.alone.light_paths[0].encode())) & 0x7FFFFFFF
@@ -244,7 +247,7 @@ class LiveLights:
             work.bins = state.bins
         work.direct = state.direct
         work.following = state.following
-        work.show(self.radiance[light], self.view_direct[light])
+        work.show(self.radiance[light], self.view_direct[light], known)
         state.work, state.direct, state.following = work, work.direct, work.following
         state.bins = work.bins if isinstance(work, AnyLight) else None
         self.revision += 1

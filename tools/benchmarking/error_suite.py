@@ -8,7 +8,7 @@ from typing import Any
 
 from tools.benchmarking.errors import ErrorSettings, measure_errors, overview
 from tools.benchmarking.parts import Effort, Parts
-from tools.benchmarking.test_lights import SETS, choose_lights, with_lights
+from tools.benchmarking.test_lights import SETS, choose_lights, drag_to, with_lights
 
 QUICK = ErrorSettings(
     pixels=60,
@@ -44,7 +44,8 @@ def measure(case: dict[str, Any], effort: Effort, quick: bool, folder: Path) -> 
         settings = settings.of_pixels(case["pixels"])
     if case["quality"] == "LIVE_FINE":  # what does not depend on the mode is measured once
         settings = replace(settings, hit_pixels=0, tolerances=(), shares=())
-    found = measure_errors(under, settings, folder / case["quality"])
+    drags = [drag_to(light, parts.tracer) for light in lights]
+    found = measure_errors(under, settings, folder / case["quality"], drags)
     for light in lights:
         found["lights"][light.name]["what"] = light.note
     return found
@@ -66,9 +67,9 @@ def markdown(results: list[dict[str, Any]]) -> list[str]:
 
 def _tables(results: list[dict[str, Any]]) -> list[str]:
     lines = [
-        "| stage, light | compression and interpolation | what is lost at rest | total"
-        " | while it moves | at rest | largest pixel | cells against true hits |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| stage, light | compression and interpolation | the same, dragged from rest | at rest | total"
+        " | dragged from rest | at a first look | at rest | largest pixel | cells against true hits |",
+        "| --- |" + " ---: |" * 9,
     ]
     found = {result["case"]["name"]: result["result"] for result in results if "result" in result}
     for stage, result in found.items():
@@ -76,15 +77,17 @@ def _tables(results: list[dict[str, Any]]) -> list[str]:
             lossy = light.get("interpolation_and_packing") or light.get("packing")
             hits = result.get("cells_against_true_hits", {}).get(name)
             lines.append(
-                f"| {stage}, {name} | {_percent(lossy)} | {_percent(light.get('lossy_at_rest'))} |"
-                f" {_percent(light['total'])} | {_percent(light['while_moving'])} | {_percent(light['at_rest'])} |"
+                f"| {stage}, {name} | {_percent(lossy)} | {_percent(light.get('lossy_dragged'))} |"
+                f" {_percent(light.get('lossy_at_rest'))} | {_percent(light['total'])} | {_percent(light['dragged'])} |"
+                f" {_percent(light['while_moving'])} | {_percent(light['at_rest'])} |"
                 f" {100 * light['total']['largest']:.0f} % | {_percent(hits)} |"
             )
     if found:
         figures = overview(found)
         lines.append(
-            f"| median; worst | {_both(figures, 'interpolation_and_packing')} | {_both(figures, 'lossy_at_rest')} |"
-            f" {_both(figures, 'total')} | {_both(figures, 'while_moving')} | {_both(figures, 'at_rest')} | | |"
+            f"| median; worst | {_both(figures, 'interpolation_and_packing')} | {_both(figures, 'lossy_dragged')} |"
+            f" {_both(figures, 'lossy_at_rest')} | {_both(figures, 'total')} | {_both(figures, 'dragged')} |"
+            f" {_both(figures, 'while_moving')} | {_both(figures, 'at_rest')} | | |"
         )
     lines += [
         "",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from icheat_usd.final_gather.gatherer import Gatherer, gathered_light
 from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import take_points
 from icheat_usd.relight import Relighter
-from icheat_usd.scene import F32
+from icheat_usd.scene import F32, F64
 from icheat_usd.transport import CellLight, Transport, build_bounces, light_cells
 from icheat_usd.transport.packed import PackedTransport
 from tools.benchmarking.converged import (
@@ -74,8 +74,25 @@ class References:
     b: tuple[F32, F32]  #: (n_lights, n_gather, 3) each
 
 
-def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -> dict[str, Any]:
-    """All errors of one scene under the lights of its snapshot; images go to `folder`."""
+@dataclass(frozen=True)
+class Dragged:
+    """Each light at the end of a drag that began at rest, where it stands in the snapshot."""
+
+    shown: list[F32]  #: (n_view, 3) each
+    radiance: F32  #: (n_lights, n_gather, 3)
+    rest: F32  #: the same, less what is like it was at rest, whose product is known exactly
+
+
+def measure_errors(
+    parts: Parts, settings: ErrorSettings, folder: Path | None, drags: Sequence[Sequence[F64]]
+) -> dict[str, Any]:
+    """All errors of one scene under the lights of its snapshot; images go to `folder`.
+
+    Parameters
+    ----------
+    drags
+        Of each light, where it is from frame to frame, (3, 4) each: from where it is at rest to where it stands.
+    """
     names = [path.rpartition("/")[2] for path in parts.snapshot.light_paths]
     started = time.perf_counter()
     just_made = parts.lights.radiance.copy()  # as while a light moves: a change shows with few samples at first
@@ -89,12 +106,13 @@ def measure_errors(parts: Parts, settings: ErrorSettings, folder: Path | None) -
     }
     # All of them before any is brought to rest: what refining finds may stay for the lights that follow.
     at_once = [parts.shown(light, at_rest=False) for light in range(len(names))]
+    dragged = drag_lights(parts, drags)
     for light, name in enumerate(names):
-        found["lights"][name] = _of_light(parts, references, light, at_once[light])
+        found["lights"][name] = _of_light(parts, references, light, at_once[light], dragged.shown[light])
         image = references.probe.to_pixels(parts.packed.to_view(just_made[light])[references.probe.samples])
         moving = relative_error(image, references.own_b[0][light], references.own_b[1][light])
         found["lights"][name]["while_moving"] = moving.as_dict()
-    for name, error in _lossy(parts, references, settings, names):
+    for name, error in _lossy(parts, references, settings, names, dragged):
         found["lights"][name] |= error
     found["edits"] = _of_edits(parts, references, settings)
     found["curve"] = _curve(parts, references, settings)
@@ -126,13 +144,36 @@ def converged_references(parts: Parts, settings: ErrorSettings) -> References:
     return References(probe, (same[0], same[1]), (other[0], other[1]), (radiance[0], radiance[1]))
 
 
-def _of_light(parts: Parts, references: References, light: int, at_once: F32) -> dict[str, Any]:
-    """Total error at frame rate, where it comes from, and what is left of it at rest; `at_once` is (n_view, 3)."""
+def drag_lights(parts: Parts, drags: Sequence[Sequence[F64]]) -> Dragged:
+    """Bring all lights to rest at the start of their drags, and move one after the other to its end."""
+    lights = parts.snapshot.lights
+    start = lights._replace(to_world=np.array([drag[0] for drag in drags], np.float32).reshape(lights.to_world.shape))
+    other = parts.under(replace(parts.snapshot, lights=start))
+    while other.live.refine():
+        pass
+    known, shown = other.lights.radiance.astype(np.float64), []
+    for light, drag in enumerate(drags):
+        for to_world in drag[1:]:
+            other.lights.change(light, to_world=to_world)
+            other.live.frame()
+        shown.append(other.shown(light, at_rest=False))
+    now = other.lights.radiance
+    # As `relight.narrow` has it: of each channel as much as comes nearest.
+    factor = (now * known).sum(axis=1) / np.maximum(np.square(known).sum(axis=1), 1e-30)
+    return Dragged(shown, now, (now - factor[:, None] * known).astype(np.float32))
+
+
+def _of_light(parts: Parts, references: References, light: int, at_once: F32, dragged: F32) -> dict[str, Any]:
+    """Total error at frame rate, where it comes from, and what is left of it at rest; images are (n_view, 3)."""
     probe, b = references.probe, parts.lights.radiance[light]
     packed = probe.to_pixels(parts.packed.to_view(b)[probe.samples])
     shown = {
         name: probe.to_pixels(image[probe.samples])
-        for name, image in (("total", at_once), ("at_rest", parts.shown(light, at_rest=True)))
+        for name, image in (
+            ("total", at_once),
+            ("dragged", dragged),
+            ("at_rest", parts.shown(light, at_rest=True)),
+        )
     }
     found = {
         **{
@@ -161,20 +202,21 @@ def _difference(image: F32, exact: F32, references: References, light: int) -> R
 
 
 def _lossy(
-    parts: Parts, references: References, settings: ErrorSettings, names: list[str]
+    parts: Parts, references: References, settings: ErrorSettings, names: list[str], dragged: Dragged
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What is lost with packing, without, and at rest: rows at the records as converged as those at the pixels."""
+    """What is lost with packing, without, dragged and at rest: rows at records as converged as those at the pixels."""
     if parts.transport.interpolation is None:
         return
     probe = references.probe.part(settings.record_pixels, settings.seed)
     kept = np.flatnonzero(np.isin(references.probe.pixel, probe.pixel))
     own, seeds = parts.lights.radiance, (settings.seed + 3000, settings.seed + 4000)
     scene = parts.snapshot, parts.tracer, parts.gather, parts.view
-    losses = lossy_errors(*scene, parts.packed, probe.samples, settings.record_rays, seeds, own)
+    n, every = len(own), np.concatenate([own, dragged.radiance, dragged.rest])
+    losses = lossy_errors(*scene, parts.packed, probe.samples, settings.record_rays, seeds, every)
     # Of rays that did not choose the pixels: what is measured stays without bias.
-    noisy = samples_of_noisy_pixels(probe, losses, settings.noisy_pixels)
+    noisy = samples_of_noisy_pixels(probe, (losses[0][:, :n], losses[1][:, :n]), settings.noisy_pixels)
     seeds = settings.seed + 5000, settings.seed + 6000
-    again = lossy_errors(*scene, parts.packed, probe.samples[noisy], settings.noisy_rays, seeds, own)
+    again = lossy_errors(*scene, parts.packed, probe.samples[noisy], settings.noisy_rays, seeds, every)
     for off, better in zip(losses, again, strict=True):
         off[:, :, noisy] = better
     # At rest nothing is packed, and some samples have other weights.
@@ -184,7 +226,7 @@ def _lossy(
     assert at_rest is not None
     changed = np.flatnonzero(changed_rows(parts.transport.interpolation, at_rest)[probe.samples])
     fitted = replace(parts.packed, source=replace(parts.transport, interpolation=at_rest))
-    resting = losses[0].copy()
+    resting = losses[0][:, :n].copy()
     seeds = settings.seed + 7000, settings.seed + 8000
     better, _ = lossy_errors(*scene, fitted, probe.samples[changed], settings.noisy_rays, seeds, own)
     resting[:, :, changed] = better
@@ -192,6 +234,8 @@ def _lossy(
         a, b = references.same_b[0][light][kept], references.same_b[1][light][kept]
         found = {}
         kinds = {"interpolation": losses[0], "interpolation_and_packing": losses[1], "lossy_at_rest": resting}
+        # What packing loses is linear in the light; that of what is known from rest is not lost.
+        kinds["lossy_dragged"] = losses[0][:, n : 2 * n] + (losses[1] - losses[0])[:, 2 * n :]
         for kind, off in kinds.items():
             one, two = (probe.to_pixels(half) for half in off[:, light])
             found[kind] = relative_error_of_halves(a + one, b + two, a, b).as_dict()
@@ -358,12 +402,14 @@ def overview(found: dict[str, Any]) -> dict[str, float]:
     for kind in (
         "total",
         "at_rest",
+        "dragged",
         "while_moving",
         "unpacked",
         "transport",
         "packing",
         "interpolation",
         "interpolation_and_packing",
+        "lossy_dragged",
         "lossy_at_rest",
         "cell_light",
     ):

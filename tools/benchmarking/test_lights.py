@@ -25,6 +25,10 @@ _LEAST_PATCH = 0.002
 SETS = {"first": 0, "second": 20_261_122}
 
 
+#: Frames of a drag, and what a light moves, in the scene's unit, or turns in each; of other axes that goes with it.
+DRAG_FRAMES, DRAG_STEP, DRAG_ANGLE = 10, 0.01, np.radians(0.3)
+
+
 @dataclass(frozen=True)
 class TestLight:
     """One light, and why it stands where it does."""
@@ -54,6 +58,36 @@ def choose_lights(snapshot: SceneSnapshot, tracer: Tracer, view: ViewSamples, se
     # The cloud of the first set stands where it always did.
     cloud = (0.6, 2.1) if seed == 0 else (float(rng.uniform(0.2, 1.2)), float(rng.uniform(0, 2 * np.pi)))
     return found + _from_outside(snapshot, tracer, places, up, rng, cloud)
+
+
+def drag_to(light: TestLight, tracer: Tracer) -> list[F64]:
+    """Where a light is from frame to frame, (3, 4) each, while it is dragged to its place as in the suite of frames.
+
+    It passes through no surface, if there is such a way. What shines from afar is turned, about no axis of its own: a
+    dome's pole moves.
+    """
+    places, way = [], _free_way(light, tracer)
+    for left in range(DRAG_FRAMES, -1, -1):
+        matrix = np.array(light.to_world, np.float64)
+        if light.kind in (LightKind.DOME, LightKind.DISTANT):
+            cos, sin = np.cos(DRAG_ANGLE * left), np.sin(DRAG_ANGLE * left)
+            turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+            turn = turn @ np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+            matrix[:, :3] = turn @ matrix[:, :3]
+        else:
+            matrix[:, 3] -= DRAG_STEP * left * way
+        places.append(matrix)
+    return places
+
+
+def _free_way(light: TestLight, tracer: Tracer) -> F64:
+    """The first of some directions in which a light comes to its place past nothing; the first if there is none."""
+    ways = np.array([np.roll(sign * np.array([1.0, 0.3, -0.5]), k) for k in range(3) for sign in (1.0, -1.0)])
+    length = float(np.linalg.norm(ways[0]))
+    back = np.ascontiguousarray(-ways / length, np.float32)
+    start = np.repeat(np.asarray(light.to_world, np.float32)[None, :, 3], len(ways), axis=0)
+    blocked = tracer.occluded(start, back, np.float32(1.2 * length * DRAG_STEP * DRAG_FRAMES))
+    return np.asarray(ways[int(np.argmin(blocked))])
 
 
 def with_lights(snapshot: SceneSnapshot, lights: list[TestLight]) -> SceneSnapshot:
