@@ -220,6 +220,13 @@ class LiveLights:
                 break
         return any(state.work is not None for state in self._lights)
 
+    def stop_following(self) -> None:
+        """Let go of what lights in motion are followed with, as their next move may be long in coming."""
+        for state in self._lights:
+            state.following = None
+            if isinstance(state.work, (AnyLight, MovingLight)):
+                state.work.following = None
+
     def cell_light(self) -> CellLight:
         """What `Relighter` takes, from the present state; its `direct` is not kept and empty."""
         return CellLight(np.zeros((len(self._lights), 0, 3), np.float32), self.radiance)

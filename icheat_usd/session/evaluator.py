@@ -114,6 +114,10 @@ class Evaluator:
         """A bounded piece of work towards what the settings ask for; False when nothing is left."""
         return self.relighter.refine(fits=not self.wants_bounces)
 
+    def leave(self) -> None:
+        """It is not looked at for now: take less memory."""
+        self.lights.stop_following()
+
     @property
     def wants_bounces(self) -> bool:
         """Whether lights at rest are still without the rays that the settings ask for; see `more_bounces`."""

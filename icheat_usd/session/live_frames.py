@@ -189,6 +189,7 @@ class LiveFrames:
                 self._changed()  # frames share what shows them: it has to come back to this one's edits
             self.resident.move(frame)
             self.session.frame = frame
+            self._leave_others()
             ready = self.level is not Level.NONE
         self._background.wake(stop_job=self._job[0] != frame)
         return ready
@@ -208,6 +209,15 @@ class LiveFrames:
             if frame is not None and frame.level is Level.REST:
                 frame.level = Level.FULL
         self._background.wake()
+
+    def _leave_others(self) -> None:
+        """What shows other frames than that at the playhead needs nothing that is for lights in motion alone."""
+        here = self.resident.get(self.resident.playhead)
+        for number in self.resident.frames():
+            frame = self.resident.get(number)
+            if frame is None or frame.evaluator is None or (here is not None and frame.evaluator is here.evaluator):
+                continue
+            frame.evaluator.leave()
 
     def _read_stack(self, snapshot: SceneSnapshot) -> EditStack:
         surfaces = {surface.path for surface in snapshot.surfaces}
@@ -338,6 +348,7 @@ class LiveFrames:
             evaluator.show(self.stack_of(frame), self.state)
             frame.evaluator, frame.level = evaluator, level
             self.resident.put(number, frame, time.perf_counter() - began)
+            self._leave_others()
         self._tell(LiveEvent("better", number, level))
 
     def _parts(self, number: float | None, level: Level) -> ShotParts:

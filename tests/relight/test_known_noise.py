@@ -9,6 +9,7 @@ import pytest
 
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
+from icheat_usd.session.frames import array_bytes
 from tests.pipeline import Pipeline
 from tests.relight.test_live_lights import gradient_image, settle
 from tests.scenes import Light, Material, Mesh, box, cornell_meshes, look_at, make_snapshot, rotation, translation
@@ -139,3 +140,25 @@ def test_it_ends_as_a_light_that_always_stood_there(scene: Pipeline):
     settle(lights)
     np.testing.assert_array_equal(lights.view_direct, true.view_direct)
     np.testing.assert_array_equal(lights.radiance, true.radiance)
+
+
+@KINDS
+def test_a_light_that_is_not_followed_takes_less_memory_and_goes_on(scene: Pipeline, light: Kind, step: float):
+    places = [step * k for k in (1, 2, 3)]
+    followed, left = (dragged(scene, light, places[:2]) for _ in range(2))
+    image = left.view_direct.copy()
+    left.stop_following()
+    np.testing.assert_array_equal(left.view_direct, image)
+    assert array_bytes([left]) < array_bytes([followed]) - image.nbytes
+    true = build(scene, light(places[2]))
+    looks = []
+    for lights in (followed, left, true):
+        if lights is not true:
+            lights.change(0, to_world=light(places[2]).to_world)
+        looks.append(lights.view_direct.copy())
+        settle(lights)
+        np.testing.assert_array_equal(lights.view_direct, followed.view_direct)
+        np.testing.assert_array_equal(lights.radiance, followed.radiance)
+    # Nothing is known of its noise now.
+    np.testing.assert_array_equal(looks[1], looks[2])
+    assert not np.array_equal(looks[0], looks[2])

@@ -111,6 +111,27 @@ def test_a_change_holds_at_every_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(live.frame(level="rest"), 0.5 * before, rtol=1e-4, atol=1e-6)
 
 
+def test_lights_in_motion_are_followed_where_the_playhead_is_alone() -> None:
+    stage = resource_path("sample_stages/animated_room/shot.usda")
+    with LiveSession.open(stage, frame=20.0, width=24, height=18, quality=QUALITY) as live:
+        path = next(iter(live.lights))
+
+        def followed() -> set[float | None]:
+            resident = live._frames.resident
+            lights = {frame: resident.get(frame).evaluator.lights._lights for frame in resident.frames()}
+            return {frame for frame, states in lights.items() if any(state.following for state in states)}
+
+        for frame in (20.0, 21.0):
+            live.scrub(frame)
+            live.wait("full")
+        with live._frames.command():  # no light comes to rest meanwhile
+            for frame in (20.0, 21.0, 20.0):
+                live.scrub(frame)
+                live.set_light(path, move=(0.01, 0.0, 0.0))
+                live.frame()
+                assert followed() == {frame}
+
+
 @pytest.mark.parametrize("frame", [float("nan"), "x"])
 def test_a_frame_that_is_no_time_is_refused(frame: object, tmp_path: Path) -> None:
     path = tmp_path / "room.usda"
