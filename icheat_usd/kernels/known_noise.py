@@ -10,7 +10,7 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.kernels.simd import address_of, load, multiply_add, positive, product, spread, store, zeros
 
 _GROUPS = 16  # of places, for the jackknife

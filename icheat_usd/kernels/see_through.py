@@ -10,7 +10,7 @@ from numba import prange
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.bsdf import dielectric_reflectance
 from icheat_usd.kernels.embree import call_1
-from icheat_usd.kernels.shadow_lanes import ORIGIN
+from icheat_usd.kernels.place_columns import ORIGIN
 from icheat_usd.kernels.surface import OPACITY, corner, corner_pair, mixed, rescaled, texel_sum, unit
 from icheat_usd.kernels.vector import dot, normalized, transform_normal
 

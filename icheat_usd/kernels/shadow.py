@@ -3,7 +3,8 @@
 The light is a table of points spread evenly over its surface. Every place looks at some of them, sends a shadow
 ray to one, chosen in proportion to what each would bring, and counts the mean of all for it (resampled
 importance sampling [1]_ over strata): unbiased over the choice of points, and without most of the noise that
-distance and cosines of a single point would have.
+distance and cosines of a single point would have. Where it is known what the whole light would bring, that can be
+counted instead (a ratio estimator with one sample [2]_): all noise that is left is then that of shadows.
 
 While a light moves little by little, most places see what they saw. Every place keeps what its last ray met. A
 frame sends the rays of a part of each run of places, another part each time; where these meet what they met
@@ -14,6 +15,7 @@ as the other points are where these all look alike; the part of rays that is sen
 points that look different, rays to such ones are sent always, and say nothing of the rest of a run.
 
 .. [1] Talbot, Cline, Egbert 2005, Importance Resampling for Global Illumination.
+.. [2] Heitz, Hill, McGuire 2018, Combining Analytic Direct Illumination and Stochastic Shadows.
 """
 
 from __future__ import annotations
@@ -24,18 +26,9 @@ from numba import prange
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.embree import PACKET, call_packet
 from icheat_usd.kernels.lanes import minus, where_above
+from icheat_usd.kernels.place_columns import COLUMNS, EDGE, ORIGIN, RUN, SPECULAR, TINT
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
-from icheat_usd.kernels.shadow_lanes import (
-    CANDIDATE,
-    COLUMNS,
-    EDGE,
-    ORIGIN,
-    RUN,
-    SPECULAR,
-    TINT,
-    look,
-    shine,
-)
+from icheat_usd.kernels.shadow_lanes import CANDIDATE, look, shine
 from icheat_usd.kernels.simd import address_of, fetch, load, multiply_add, plus, product, spread, store
 
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
@@ -358,7 +351,7 @@ def _fetch_columns(columns: int, column: np.ndarray, run: int, other: int, first
 @kernel
 def _light_runs(
     function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
-    colors: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray,
+    colors: np.ndarray, form: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray,
     columns: np.ndarray, column: np.ndarray, lobes: np.ndarray, diffuse: np.float32, specular: np.float32,
     share_rays: bool, phase: int, known: np.ndarray, told: np.ndarray, row: np.ndarray, wanted: np.ndarray,
     out: np.ndarray, through: np.ndarray, first: int, last: int,
@@ -404,7 +397,7 @@ def _light_runs(
             number = plus(load(address_of(numbers) + lane * 4), shift)
             number = where_above(number, below_one, minus(number, one), number)
             look(
-                address_of(points) + offset * 4, width, candidates, distant, at, lane, number, room,
+                address_of(points) + offset * 4, width, candidates, distant, form, at, lane, number, room,
                 address_of(found[k]), address_of(chosen[k]),
             )  # fmt: skip
         for j in range(RUN):
@@ -444,6 +437,7 @@ def light_places(
     points: np.ndarray,
     first_point: np.ndarray,
     colors: np.ndarray,
+    form: np.ndarray,
     light: np.ndarray,
     distant: bool,
     seed: int,
@@ -479,13 +473,16 @@ def light_places(
         Places of a run look at groups that follow one another.
     first_point : (n_groups + `RUN`,) int32, number of the first point of each group
     colors : (m, 3) float32, colour of each point; none: all are white
+    form : (n,) float32
+        Of the light, as `clear_light` has it: places that have all of it above their horizon count what all of it
+        brings where they see the point they chose. None: the mean of the points.
     light : (4, 3) float32, least and largest place of the points, and least and largest normal
     turn : int
         Number of the ray of each place.
     bounds : (n_runs, 4, 3) float32, least and largest origin of a run, and least and largest geometric normal
     columns : (n_columns, `RUN`) float32
     column : (n_runs, `COLUMNS`) int32
-        Number of each of a run's columns, as `shadow_lanes` names them; runs may share some.
+        Number of each of a run's columns, as `place_columns` names them; runs may share some.
     lobes : (n_runs,) bool, whether a place of the run has a lobe
     diffuse, specular : float32, factors of what places reflect
     share_rays : bool
@@ -514,7 +511,7 @@ def light_places(
         turn_of = np.int64(i)
         task = 2 * turn_of if turn_of < half else 2 * (turn_of - half) + 1
         _light_runs(
-            function, arguments, opaque, passing, points, first_point, colors, light, distant, seed, turn, bounds,
+            function, arguments, opaque, passing, points, first_point, colors, form, light, distant, seed, turn, bounds,
             columns, column, lobes, diffuse, specular, share_rays, phase, known, told, row, wanted, out, through,
             task * _RUNS, min(n_runs, (task + 1) * _RUNS),
         )  # fmt: skip

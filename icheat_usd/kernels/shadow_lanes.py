@@ -8,26 +8,32 @@ from typing import Any
 import numpy as np
 
 from icheat_usd.kernels._jit import kernel
+from icheat_usd.kernels.clear_light import BALL, clear_light
 from icheat_usd.kernels.lanes import minus, ratio, root, store_whole, where_above
+from icheat_usd.kernels.place_columns import (
+    ALPHA,
+    COSINE,
+    EYE,
+    LAMBDA,
+    NORMAL,
+    ORIGIN,
+    RUN,
+    SHADING,
+)
 from icheat_usd.kernels.simd import load, multiply_add, plus, product, spread, store, zeros
 
-RUN = 64  #: successive places that share shadow rays if that is allowed
-#: Columns of a run of places, one number for each: origin off the surface, geometric normal, shading normal, albedo
-#: over pi; and where a place has a lobe, `specular`, `specular_edge`, alpha (0: no lobe), cosine to the eye, Smith's
-#: Lambda of the eye, direction to the eye. The first ones of three, or the one.
-ORIGIN, NORMAL, SHADING, TINT = 0, 3, 6, 9
-SPECULAR, EDGE, ALPHA, COSINE, LAMBDA, EYE = 12, 15, 18, 19, 20, 21
-COLUMNS = 24  #: of a run
 POINT = 7  #: columns of the table of points that are looked at for every place
 #: Floats that `look` needs for each candidate of 16 places.
 CANDIDATE = 64
 _ONE = np.float32(1.0)
+# Weight of a point on the far side of a ball beside that of one at this side.
+_RIM = np.float32(-1e-3)
 
 
 @kernel
 def look(
-    points: int, width: int, candidates: int, distant: bool, at: np.ndarray, lane: int, number: Any, room: int,
-    found: int, choice_of: int,
+    points: int, width: int, candidates: int, distant: bool, form: np.ndarray, at: np.ndarray, lane: int, number: Any,
+    room: int, found: int, choice_of: int,
 ) -> None:  # fmt: skip
     """What 16 places of a run, from number `lane`, get from their candidates, and which they would send a ray to.
 
@@ -37,6 +43,8 @@ def look(
         Of the columns of the first place's candidates, each `width` floats long; of `CANDIDATE` floats for each
         candidate; of the run's rows of what is found: direction to the chosen point (for distant lights) or way to it,
         and light; and of the number of each place's chosen candidate, int32.
+    form : (n,) float32, of the light, as `clear_light` has it
+        Where that knows what the whole light brings, it is what is found, else the mean of the candidates.
     at : (`COLUMNS`,) int64, addresses of the run's columns
     number : 16 random numbers
     """
@@ -45,6 +53,9 @@ def look(
     gx, gy, gz = load(at[NORMAL] + skip), load(at[NORMAL + 1] + skip), load(at[NORMAL + 2] + skip)
     nx, ny, nz = load(at[SHADING] + skip), load(at[SHADING + 1] + skip), load(at[SHADING + 2] + skip)
     none, total = zeros(), zeros()
+    clear = clear_light(form, at, lane)
+    is_ball = len(form) > 0 and form[0] == BALL
+    inverse = ratio(spread(_ONE), clear)
     for c in range(candidates):
         point, kept = points + (c * POINT * width + lane) * 4, room + c * CANDIDATE * 4
         dx, dy, dz, power = load(point), load(point + step), load(point + 2 * step), load(point + 6 * step)
@@ -61,9 +72,13 @@ def look(
             )
             square = multiply_add(dx, dx, multiply_add(dy, dy, product(dz, dz)))
             weight = product(ratio(product(here, minus(none, away)), product(square, square)), power)
-            weight = where_above(none, away, weight, none)
+            # Where it is known what all of the light brings, some point is looked at in any case.
+            rim = where_above(clear, none, product(weight, spread(_RIM)), none)
+            weight = where_above(none, away, weight, rim)
         above = multiply_add(dx, gx, multiply_add(dy, gy, product(dz, gz)))
         weight = where_above(here, none, where_above(above, none, weight, none), none)
+        if is_ball:
+            weight = where_above(clear, none, _sharp(product(weight, inverse)), weight)
         store(kept, dx)
         store(kept + 64, dy)
         store(kept + 128, dz)
@@ -83,8 +98,21 @@ def look(
     store(out, dx)
     store(out + RUN * 4, dy)
     store(out + RUN * 8, dz)
-    store(out + RUN * 12, product(total, spread(_ONE / np.float32(candidates))))
+    total = product(total, spread(_ONE / np.float32(candidates)))
+    store(out + RUN * 12, where_above(clear, none, clear, total))
     store_whole(choice_of + lane * 4, choice)
+
+
+@kernel
+def _sharp(weight: Any) -> Any:
+    """Weight of a point of a ball, half of whose points are in view.
+
+    The brighter of two points that are spread evenly over a hemisphere is spread as its light is, ``2 c`` by the cosine
+    ``c``: a high power picks it. Picked in proportion to their light, points of the rim come too often.
+    """
+    square = product(weight, weight)
+    fourth = product(square, square)
+    return product(fourth, fourth)
 
 
 @kernel

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.environment import F32, F64, Floats, Table, search_cdf
+from icheat_usd.kernels.place_columns import ORIGIN, RUN
 from icheat_usd.kernels.shadow import STATES
-from icheat_usd.kernels.shadow_lanes import ORIGIN, RUN
 
 I32 = NDArray[np.int32]
 I16 = NDArray[np.int16]

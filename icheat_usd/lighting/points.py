@@ -6,10 +6,13 @@ import functools
 
 import numpy as np
 
+from icheat_usd.kernels.clear_light import BALL, RECTANGLE
 from icheat_usd.kernels.random import sobol_pair
 from icheat_usd.scene import F32, F64, LightKind, SceneSnapshot
 
 N_POINTS = 256  # shadows of a light have so many steps
+_OTHER = 0x9E3779B9  # of the seed, for points that know nothing of those of the seed
+_ROUND = 1e-4  # how far a ball's squared axes may be from equal
 
 
 def has_points(kind: int) -> bool:
@@ -22,8 +25,22 @@ def _numbers(seed: int) -> F64:
     return np.array([sobol_pair(k, seed) for k in range(N_POINTS)], np.float64)
 
 
-def light_points(snapshot: SceneSnapshot, seed: int) -> tuple[F32, bool]:
+@functools.lru_cache(maxsize=64)
+def _opposite_numbers(seed: int) -> F64:
+    """Of a ball's points in groups of four: two, each with the one opposite, so that two face a place far away."""
+    two = np.stack([_numbers(number)[: N_POINTS // 4] for number in (seed, seed ^ _OTHER)], axis=1)
+    opposite = np.stack([1.0 - two[..., 0], (two[..., 1] + 0.5) % 1.0], axis=-1)
+    return np.stack([two, opposite], axis=2).reshape(-1, 2)
+
+
+def light_points(snapshot: SceneSnapshot, seed: int, *, opposite: bool = False) -> tuple[F32, bool]:
     """Points of the one light of a snapshot.
+
+    Parameters
+    ----------
+    opposite
+        Of a ball, two of every four points that follow one another lie opposite the other two. Any few of them are
+        evener so, all of them less.
 
     Returns
     -------
@@ -37,7 +54,7 @@ def light_points(snapshot: SceneSnapshot, seed: int) -> tuple[F32, bool]:
     kind = LightKind(int(lights.kind[0]))
     linear, origin = lights.to_world[0, :, :3].astype(np.float64), lights.to_world[0, :, 3].astype(np.float64)
     a, b = (float(size) for size in lights.size[0])
-    u = _numbers(seed & 0xFFFFFFFF)
+    u = (_opposite_numbers if opposite else _numbers)(seed & 0xFFFFFFFF)
     color: F64 = np.ones((1, 3))  # of all points, unless an image says more
     if kind == LightKind.DISTANT:
         place, area = _cone(linear, a, u)
@@ -47,9 +64,7 @@ def light_points(snapshot: SceneSnapshot, seed: int) -> tuple[F32, bool]:
         place = origin + flat @ linear[:, :2].T
         across = _cross(linear[:, 0], linear[:, 1])
         scale = float(np.linalg.norm(across))
-        # the third axis decides the side, so that a mirrored light still shines where its own -Z went
-        side = 1.0 if across @ linear[:, 2] < 0.0 else -1.0
-        normal = np.broadcast_to(side * across / max(scale, 1e-300), place.shape)
+        normal = np.broadcast_to(_side(linear) * across / max(scale, 1e-300), place.shape)
         area = np.full(1, scale * (a * b if kind == LightKind.RECT else np.pi * a * a))
         if kind == LightKind.RECT and lights.texture[0] >= 0:
             color = _image(snapshot, 1.0 - u)
@@ -70,6 +85,35 @@ def light_points(snapshot: SceneSnapshot, seed: int) -> tuple[F32, bool]:
     table[:, 9] = mean
     table[:, 6:9] = shining / np.maximum(mean, 1e-300)[:, None]
     return table, kind == LightKind.DISTANT
+
+
+def light_form(snapshot: SceneSnapshot) -> F32:
+    """Form of the one light of a snapshot, for `kernels.clear_light`.
+
+    Returns
+    -------
+    (6,) of a ball, (14,) of a rectangle without an image, (0,) of others, float32
+    """
+    lights = snapshot.lights
+    kind, (a, b) = LightKind(int(lights.kind[0])), (float(size) for size in lights.size[0])
+    linear, origin = lights.to_world[0, :, :3].astype(np.float64), lights.to_world[0, :, 3].astype(np.float64)
+    radiance = float(lights.radiance[0].mean())
+    if kind == LightKind.SPHERE:
+        scale = float(np.linalg.norm(linear[:, 0]))
+        if np.allclose(linear.T @ linear, np.eye(3) * scale**2, rtol=0.0, atol=_ROUND * scale**2):
+            return np.array([BALL, np.pi * (a * scale) ** 2 * radiance, *origin, a * scale], np.float32)
+    elif kind == LightKind.RECT and lights.texture[0] < 0:
+        corners = np.array([(-a, -b), (a, -b), (a, b), (-a, b)]) / 2.0 @ linear[:, :2].T + origin
+        return np.array([RECTANGLE, -_side(linear) * np.pi * radiance, *corners.ravel()], np.float32)
+    return np.zeros(0, np.float32)
+
+
+def _side(linear: F64) -> float:
+    """Whether a flat light shines to where its first two axes turn as a right hand does: 1, or -1.
+
+    The third axis decides it, so that a mirrored light still shines where its own -Z went.
+    """
+    return 1.0 if _cross(linear[:, 0], linear[:, 1]) @ linear[:, 2] < 0.0 else -1.0
 
 
 def _cross(a: F64, b: F64) -> F64:

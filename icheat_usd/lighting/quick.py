@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
+from icheat_usd.kernels.clear_light import BALL
+from icheat_usd.kernels.place_columns import ALPHA, COLUMNS, RUN, SHADING, SPECULAR
 from icheat_usd.kernels.see_through import cross_layers, dim_places
 from icheat_usd.kernels.shadow import PART, SHARED_PART, STRIDE, TURNED, light_places, tell_points
-from icheat_usd.kernels.shadow_lanes import ALPHA, COLUMNS, RUN, SHADING, SPECULAR
 from icheat_usd.kernels.shaping import shape_places
 from icheat_usd.lighting.controls import darken, emission_frame, without
-from icheat_usd.lighting.points import light_points
+from icheat_usd.lighting.points import light_form, light_points
 from icheat_usd.materials import is_glossy
 from icheat_usd.scene import F32, I32, I64, Bool, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import build_tracer, spawn_points
@@ -28,6 +29,7 @@ _CANDIDATES = 4  # points of the light that a place looks at
 _FEW_CANDIDATES = 2  # where places share rays
 _PIECE = 256  # runs of a look that a thread takes at a time
 _NO_POINTS = np.zeros(0, np.int32)
+_NO_FORM = np.zeros(0, np.float32)
 # A point has turned if more than this share of the places that see it, now or before, met something else; what is said
 # of nearly all places may be wrong of so many; and from how many rays on either is said.
 _TURNED_SHARE, _ALL_BUT, _LEAST_LOOKS = 0.2, 0.03, 3
@@ -255,12 +257,12 @@ class Shining:
 
     Parameters
     ----------
-    table, distant
-        As `lighting.points.light_points` has them.
+    table, distant, form
+        As `light_points` and `light_form` of `lighting.points` have them.
     """
 
-    def __init__(self, table: F32, distant: bool) -> None:
-        self.table, self.distant = table, distant
+    def __init__(self, table: F32, distant: bool, form: F32 = _NO_FORM) -> None:
+        self.table, self.distant, self.form = table, distant, form
         least, largest = table[:, :6].min(axis=0), table[:, :6].max(axis=0)
         #: Least and largest place and normal of the points, (4, 3).
         self.bounds: F32 = np.stack([least[:3], largest[:3], least[3:6], largest[3:6]])
@@ -286,9 +288,22 @@ def _order_of_groups(n_points: int, candidates: int, turn: int) -> tuple[I64, I3
     return group, (group * candidates).astype(np.int32)
 
 
-def shining_points(snapshot: SceneSnapshot, seed: int) -> Shining:
-    """Points of the one light of a snapshot."""
-    return Shining(*light_points(snapshot, seed))
+def shining_points(snapshot: SceneSnapshot, seed: int, *, by_form: bool = False) -> Shining:
+    """Points of the one light of a snapshot.
+
+    Parameters
+    ----------
+    by_form
+        Places that have all of a ball or a rectangle above their horizon get what all of it brings, where the point
+        that they look at is not hidden: without the noise of points, but at borders of shadows the mean over turns is
+        not quite the light there.
+    """
+    form = light_form(snapshot) if by_form else _NO_FORM
+    return Shining(*light_points(snapshot, seed, opposite=_is_ball(form)), form)
+
+
+def _is_ball(form: F32) -> bool:
+    return len(form) > 0 and bool(form[0] == BALL)
 
 
 class Look:
@@ -317,7 +332,8 @@ class Look:
         controls = snapshot.controls(0)
         self._diffuse, self._specular = controls.diffuse, controls.specular
         self._seed, self._share_rays, self._turn = seed, share_rays, turn
-        self._groups = shining.groups(_FEW_CANDIDATES if share_rays else _CANDIDATES, turn)
+        is_few = share_rays and not _is_ball(shining.form)  # a ball hides half of its points
+        self._groups = shining.groups(_FEW_CANDIDATES if is_few else _CANDIDATES, turn)
         self._through = np.empty(0 if shadows.passing is None else places.n, np.int32)
         self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
         self._crossing = np.empty(len(self._through), np.float32) if last is None else last.crossing
@@ -348,6 +364,7 @@ class Look:
             groups.points,
             groups.first,
             groups.colors,
+            self._shining.form,
             self._shining.bounds,
             self._shining.distant,
             self._seed,

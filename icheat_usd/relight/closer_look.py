@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icheat_usd.kernels.closer_look import noise_of_runs, take_closer_looks
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.kernels.workers import take_back
 from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, direct_at
 from icheat_usd.samples import GatherSamples

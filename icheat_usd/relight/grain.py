@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.samples import ViewSamples
 from icheat_usd.scene import F32, F64, I32, I64, Bool
 

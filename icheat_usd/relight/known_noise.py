@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icheat_usd.kernels.known_noise import take_noise
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.scene import F32, I32
 
 #: Part of all light that counts beside that of a run when its noise is judged.

@@ -333,7 +333,7 @@ class MovingLight:
         self, around: Surroundings, alone: SceneSnapshot, seed: int, light_samples: int, dome_samples: int | None
     ) -> None:
         self._around, self._alone, self._seed, self._rounds = around, alone, seed, light_samples
-        self._shining = shining_points(alone, seed)
+        self._shining = shining_points(alone, seed, by_form=True)
         self._step = self._n_found = self._n_near = 0
         self._near: I64 | None = None  # cells next to the light, from the last round on
         #: View samples next to it or with narrow lobes, and how many rays these get, once the bounces are done.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.kernels.known_noise import take_noise
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.scene import F32, F64
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.kernels.shadow import (
     APPEARED,
     BURIED,
@@ -17,7 +18,6 @@ from icheat_usd.kernels.shadow import (
     is_turned_away,
     light_places,
 )
-from icheat_usd.kernels.shadow_lanes import RUN
 from icheat_usd.lighting import build_light_sampler, irradiance, reflected_direct
 from icheat_usd.lighting.change import LightImages, changed_light, one_light, texture_image
 from icheat_usd.lighting.domes import BinnedSky, see_sky, white_sky
@@ -384,3 +384,61 @@ def test_runs_behind_a_light_are_dark_without_a_look(name: str) -> None:
     light = shining_points(snapshot, 5)
     turned_away = [is_turned_away(some, light.bounds, light.distant) for some in places.bounds]
     assert 0.1 < np.mean(turned_away) < 0.9
+
+
+def by_form(
+    light: Light, points: SurfacePoints, share_rays: bool, blocker: bool = True, turns: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of some looks at a floor by a light's form, and of many by its points."""
+    meshes = [Mesh(quad(3.0), Material(0.5), path="/floor")]
+    if blocker:
+        meshes.append(Mesh(quad(0.5), Material(0.5), [translation(0.1, 0.4, 0.1)], "/table"))
+    snapshot = make_snapshot(meshes, lights=[light])
+    shadows = build_shadows(snapshot, tracer_of(snapshot))
+    places = prepare_places(snapshot, points, points.albedo, None)
+    total, look = np.zeros((len(points.instance), 3)), np.empty((len(points.instance), 3), np.float32)
+    shining = shining_points(snapshot, 7, by_form=True)
+    for turn in range(turns):
+        direct_at(snapshot, shadows, places, 7, share_rays, look, turn, shining=shining)
+        total += look
+    return total / turns, rounds(snapshot, points, None, 256)
+
+
+WHOLE = {
+    "ball": Light(LightKind.SPHERE, (3, 2, 1), translation(0.2, 1.0, 0)[:3], (0.3, 0)),
+    "rect": LIGHTS["rect"],
+    "mirrored": LIGHTS["mirrored"],
+}
+
+
+@pytest.mark.parametrize("share_rays", [False, True])
+@pytest.mark.parametrize("name", WHOLE)
+def test_by_its_form_a_light_that_nothing_hides_has_no_noise(name: str, share_rays: bool) -> None:
+    points = on_floor(scene(WHOLE[name], Material(0.5)), 2000)
+    look, expected = by_form(WHOLE[name], points, share_rays, blocker=False)
+    np.testing.assert_allclose(look, expected, rtol=0.03)
+    assert np.sqrt(((look - expected) ** 2).sum() / (expected**2).sum()) < 0.01
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_shadows_of_a_light_by_its_form_are_where_they_are_by_its_points(name: str) -> None:
+    points = on_floor(scene(WHOLE[name], Material(0.5)), 20_000)
+    look, expected = by_form(WHOLE[name], points, False, turns=16)
+    clear = by_form(WHOLE[name], points, False, blocker=False)[0]
+    found, true = look.sum(1) / clear.sum(1), expected.sum(1) / clear.sum(1)
+    assert found[true < 1e-3].mean() < 1e-3 and found[true > 0.999].mean() > 0.999
+    for low in np.arange(0.05, 0.95, 0.1):  # places of some darkness at the border
+        some = (true >= low) & (true < low + 0.1)
+        assert some.sum() > 20 and abs(found[some].mean() - true[some].mean()) < 0.06
+
+
+@pytest.mark.parametrize("name", ["image", "disk", "sphere", "cylinder", "sun", "beam"])
+def test_lights_without_a_form_look_as_they_do_by_their_points(name: str) -> None:
+    snapshot = scene(LIGHTS[name], Material(0.5))
+    points = on_floor(snapshot, 500)
+    places = prepare_places(snapshot, points, points.albedo, None)
+    shadows, looks = build_shadows(snapshot, tracer_of(snapshot)), []
+    for whole in (True, False):
+        looks.append(np.empty((500, 3), np.float32))
+        direct_at(snapshot, shadows, places, 7, False, looks[-1], shining=shining_points(snapshot, 7, by_form=whole))
+    np.testing.assert_array_equal(*looks)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.lighting import build_light_sampler, reflected_direct
 from icheat_usd.lighting.quick import Places
 from icheat_usd.relight import light_work

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.shadow_lanes import RUN
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.lighting import build_light_sampler, reflected_direct
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.relight import view_light
