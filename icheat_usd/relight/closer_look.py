@@ -11,13 +11,14 @@ from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, direct
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot
 
-#: Runs of patch points that are looked at in a frame, and with them their neighbours: some 40,000 points.
-MOST_RUNS = 384
+#: Runs of patch points that are looked at in a frame, and with them their neighbours: some 40,000 points. Suns cost
+#: less, and borders of their patches need more.
+MOST_RUNS, MOST_RUNS_OF_SUN = 384, 512
 #: Of these, the noisiest, such as those next to a small light, are looked at so many times.
 WORST_RUNS, TURNS = 16, 4
 #: Noise of all cells, beside all light of theirs, below which no run is worth a look; and what looks may leave of more.
 #: Light that lies on many cells averages: at .0015 an image was .4 % off, at .0065, from a sun in a window, 22 %.
-LITTLE_NOISE, LEFT_NOISE = 2e-3, 5e-4
+LITTLE_NOISE, LEFT_NOISE, LEFT_NOISE_OF_SUN = 2e-3, 5e-4, 2e-4
 
 
 class CloserLook:
@@ -55,7 +56,7 @@ class CloserLook:
         told
             As `direct_at` has it.
         """
-        light, runs = self._noisy_runs(direct)
+        light, runs = self._noisy_runs(direct, shining.distant)
         before, self._looked_at = self._looked_at, np.zeros_like(self._looked_at)
         self._looked_at[runs] = 1
         # What was not looked at in the frame before may be far from what it was.
@@ -63,7 +64,9 @@ class CloserLook:
         if not len(runs):
             return
         take_back()
-        direct_at(alone, shadows, self._patches, seed, False, self._found, 0, self._last, shining, runs, told)
+        # Borders of a sun's patch go by faster than rays of a part of the points find them.
+        last = None if shining.distant else self._last
+        direct_at(alone, shadows, self._patches, seed, False, self._found, 0, last, shining, runs, told)
         self._take(runs, direct)
         take_back()
         worst = self._worst_runs(direct, light, runs)
@@ -84,14 +87,15 @@ class CloserLook:
         noise_of_runs(direct, self._gather.area, begin, end, found)
         return found[0], float(found[1].sum())
 
-    def _noisy_runs(self, direct: F32) -> tuple[float, I32]:
+    def _noisy_runs(self, direct: F32, distant: bool) -> tuple[float, I32]:
         """Light of all cells, and runs that are worth a look, ascending."""
+        most_runs, left_noise = (MOST_RUNS_OF_SUN, LEFT_NOISE_OF_SUN) if distant else (MOST_RUNS, LEFT_NOISE)
         noise, light = self._noise(direct)
         if noise.sum() <= (LITTLE_NOISE * light) ** 2:
             return light, np.empty(0, np.int32)
-        most = _largest(noise, MOST_RUNS)
+        most = _largest(noise, most_runs)
         left = noise.sum() - np.cumsum(noise[most])
-        most = most[: 1 + np.searchsorted(-left, -((LEFT_NOISE * light) ** 2))]
+        most = most[: 1 + np.searchsorted(-left, -((left_noise * light) ** 2))]
         # Beside what is seen to differ lies what one look has missed, such as the border of a patch of sun.
         wanted = np.zeros(len(noise) + 2, np.bool_)
         for beside in range(3):

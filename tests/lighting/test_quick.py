@@ -411,8 +411,9 @@ WHOLE = {
 }
 
 
-@pytest.mark.parametrize("share_rays", [False, True])
-@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize(
+    ("name", "share_rays"), [("ball", False), ("ball", True), ("rect", False), ("mirrored", False)]
+)
 def test_by_its_form_a_light_that_nothing_hides_has_no_noise(name: str, share_rays: bool) -> None:
     points = on_floor(scene(WHOLE[name], Material(0.5)), 2000)
     look, expected = by_form(WHOLE[name], points, share_rays, blocker=False)
@@ -432,13 +433,17 @@ def test_shadows_of_a_light_by_its_form_are_where_they_are_by_its_points(name: s
         assert some.sum() > 20 and abs(found[some].mean() - true[some].mean()) < 0.06
 
 
-@pytest.mark.parametrize("name", ["image", "disk", "sphere", "cylinder", "sun", "beam"])
-def test_lights_without_a_form_look_as_they_do_by_their_points(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "share_rays"),
+    [(name, False) for name in ("image", "disk", "sphere", "cylinder", "sun", "beam")] + [("rect", True)],
+)
+def test_lights_without_a_form_look_as_they_do_by_their_points(name: str, share_rays: bool) -> None:
     snapshot = scene(LIGHTS[name], Material(0.5))
     points = on_floor(snapshot, 500)
     places = prepare_places(snapshot, points, points.albedo, None)
     shadows, looks = build_shadows(snapshot, tracer_of(snapshot)), []
     for whole in (True, False):
         looks.append(np.empty((500, 3), np.float32))
-        direct_at(snapshot, shadows, places, 7, False, looks[-1], shining=shining_points(snapshot, 7, by_form=whole))
+        shining = shining_points(snapshot, 7, by_form=whole)
+        direct_at(snapshot, shadows, places, 7, share_rays, looks[-1], shining=shining)
     np.testing.assert_array_equal(*looks)

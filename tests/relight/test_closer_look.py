@@ -55,6 +55,25 @@ def test_a_first_look_has_less_than_half_of_the_noise(light: Light, monkeypatch:
     assert np.mean(closer) < 0.5 * np.mean(plain)
 
 
+def test_a_sun_that_turns_is_as_well_known_as_at_a_first_look() -> None:
+    """Its patch goes over cells that looked dark before."""
+    turned = [Light(LightKind.DISTANT, (3, 3, 3), rotation((0, 1, 0), 35 - k)[:3], (0.01, 0.0)) for k in range(8)]
+    pipeline = Pipeline(room(turned[-1]), n_gather=2048)
+    moved, first = [], []
+    for seed in range(4):
+        fresh = first_look(pipeline, seed)
+        lights = first_look(pipeline, seed)
+        for light in turned:
+            lights.change(0, to_world=light.to_world)
+        looks = [fresh._lights[0].direct.copy(), lights._lights[0].direct.copy()]
+        while fresh.refine():
+            pass
+        known = fresh._lights[0].direct
+        for errors, look in zip((first, moved), looks, strict=True):
+            errors.append(error(look, known, pipeline.gather.area))
+    assert np.mean(moved) < 1.1 * np.mean(first)
+
+
 def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where cells beside each other get the same light, no ray is sent."""
     pipeline = Pipeline(room(SUN), n_gather=512)
@@ -62,12 +81,12 @@ def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lights._around.patches is not None
     look = CloserLook(lights._around.patches, pipeline.gather)
     even = np.ones((pipeline.gather.n, 3), np.float32)
-    assert len(look._noisy_runs(even)[1]) == 0
+    assert len(look._noisy_runs(even, False)[1]) == 0
     assert len(look._worst_runs(even, 1.0, np.arange(4, dtype=np.int32))) == 0
     monkeypatch.setattr(closer_look, "MOST_RUNS", 2)
     spotted = even.copy()
     spotted[::50] = 9.0
-    assert 2 < len(look._noisy_runs(spotted)[1]) <= 6
+    assert 2 < len(look._noisy_runs(spotted, False)[1]) <= 6
 
 
 def test_noise_of_runs_is_that_of_a_plain_loop() -> None:
