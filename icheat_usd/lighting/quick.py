@@ -332,9 +332,11 @@ class Look:
         controls = snapshot.controls(0)
         self._diffuse, self._specular = controls.diffuse, controls.specular
         self._seed, self._share_rays, self._turn = seed, share_rays, turn
-        # A ball hides half of its points; what those of a rectangle bring differs little beside noise of shadows.
-        is_few = share_rays and not _is_ball(shining.form)
-        self._form = _NO_FORM if is_few else shining.form
+        # What points of a rectangle bring differs little beside the noise of shadows that rays are shared for.
+        is_ball = _is_ball(shining.form)
+        self._form = _NO_FORM if share_rays and not is_ball else shining.form
+        # A ball hides half of its points; of others few are enough where the whole is known.
+        is_few = not is_ball and (share_rays or len(shining.form) > 0)
         self._groups = shining.groups(_FEW_CANDIDATES if is_few else _CANDIDATES, turn)
         self._through = np.empty(0 if shadows.passing is None else places.n, np.int32)
         self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)
