@@ -4,7 +4,8 @@ The light is a table of points spread evenly over its surface. Every place looks
 ray to one, chosen in proportion to what each would bring, and counts the mean of all for it (resampled
 importance sampling [1]_ over strata): unbiased over the choice of points, and without most of the noise that
 distance and cosines of a single point would have. Where it is known what the whole light would bring, that can be
-counted instead (a ratio estimator with one sample [2]_): all noise that is left is then that of shadows.
+counted instead (a ratio estimator with one sample [2]_): all noise that is left is then that of shadows. Next to a long
+rectangle few points tell too little of how much of it is hidden: there it is done where nothing is.
 
 While a light moves little by little, most places see what they saw. Every place keeps what its last ray met. A
 frame sends the rays of a part of each run of places, another part each time; where these meet what they met
@@ -24,12 +25,13 @@ import numpy as np
 from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
+from icheat_usd.kernels.clear_light import RECTANGLE, clear_light
 from icheat_usd.kernels.embree import PACKET, call_packet
 from icheat_usd.kernels.lanes import minus, where_above
 from icheat_usd.kernels.place_columns import COLUMNS, EDGE, ORIGIN, RUN, SPECULAR, TINT
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
 from icheat_usd.kernels.shadow_lanes import CANDIDATE, look, shine
-from icheat_usd.kernels.simd import address_of, fetch, load, multiply_add, plus, product, spread, store
+from icheat_usd.kernels.simd import address_of, fetch, load, multiply_add, plus, product, spread, store, zeros
 
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
 PART = 8  #: one of so many places of a run sends a ray where all have met the same so far, and that is enough
@@ -317,6 +319,18 @@ def _reflect(
 
 
 @kernel
+def _take_whole(form: np.ndarray, at: np.ndarray, chosen: np.ndarray, state: np.ndarray, found: np.ndarray) -> None:
+    """What all of a light brings for what is found of it by points, if none of a run's places is in its shadow."""
+    for j in range(RUN):
+        if chosen[j] >= 0 and state[j] != _CLEAR:
+            return
+    light = address_of(found) + 3 * RUN * 4
+    for lane in range(0, RUN, 16):
+        whole = clear_light(form, at, lane)
+        store(light + lane * 4, where_above(whole, zeros(), whole, load(light + lane * 4)))
+
+
+@kernel
 def _get_nothing(run: int, row: np.ndarray, out: np.ndarray, through: np.ndarray, known: np.ndarray) -> None:
     """What `light_places` says of a run that is turned away from the light."""
     begin, end = run * RUN, min((run + 1) * RUN, len(row))
@@ -410,6 +424,8 @@ def _light_runs(
     for k in range(n):
         run = runs[k]
         _find_columns(every_column, column, run, at)
+        if len(form) > 0 and form[0] == RECTANGLE:
+            _take_whole(form, at, chosen[k], state[k], found[k])
         _reflect(colors, at, lobes[run] != 0, diffuse, specular, found[k], chosen[k], state[k], room)
         red, green, blue, of_run = found[k, 0], found[k, 1], found[k, 2], run * RUN
         size = min(RUN, len(row) - of_run)
@@ -475,7 +491,8 @@ def light_places(
     colors : (m, 3) float32, colour of each point; none: all are white
     form : (n,) float32
         Of the light, as `clear_light` has it: places that have all of it above their horizon count what all of it
-        brings where they see the point they chose. None: the mean of the points.
+        brings; of a ball where they see the point they chose, of a rectangle where all of their run see theirs. None:
+        the mean of the points.
     light : (4, 3) float32, least and largest place of the points, and least and largest normal
     turn : int
         Number of the ray of each place.

@@ -44,7 +44,7 @@ def look(
         candidate; of the run's rows of what is found: direction to the chosen point (for distant lights) or way to it,
         and light; and of the number of each place's chosen candidate, int32.
     form : (n,) float32, of the light, as `clear_light` has it
-        Where that knows what the whole light brings, it is what is found, else the mean of the candidates.
+        What the whole of a ball brings is what is found, where that is known, else the mean of the candidates.
     at : (`COLUMNS`,) int64, addresses of the run's columns
     number : 16 random numbers
     """
@@ -53,8 +53,8 @@ def look(
     gx, gy, gz = load(at[NORMAL] + skip), load(at[NORMAL + 1] + skip), load(at[NORMAL + 2] + skip)
     nx, ny, nz = load(at[SHADING] + skip), load(at[SHADING + 1] + skip), load(at[SHADING + 2] + skip)
     none, total = zeros(), zeros()
-    clear = clear_light(form, at, lane)
     is_ball = len(form) > 0 and form[0] == BALL
+    clear = clear_light(form, at, lane) if is_ball else zeros()
     inverse = ratio(spread(_ONE), clear)
     for c in range(candidates):
         point, kept = points + (c * POINT * width + lane) * 4, room + c * CANDIDATE * 4

@@ -294,9 +294,9 @@ def shining_points(snapshot: SceneSnapshot, seed: int, *, by_form: bool = False)
     Parameters
     ----------
     by_form
-        Places that have all of a ball above their horizon, or of a rectangle where they share no rays, get what all of
-        it brings, if the point that they look at is not hidden: without the noise of points, but at borders of shadows
-        the mean over turns is not quite the light there.
+        Places that have all of a ball above their horizon get what all of it brings, if the point that they look at is
+        not hidden, and those that share no rays what all of a rectangle brings, if all next to them see their points:
+        without the noise of points, but at borders of shadows the mean over turns is not quite the light there.
     """
     form = light_form(snapshot) if by_form else _NO_FORM
     return Shining(*light_points(snapshot, seed, opposite=_is_ball(form)), form)
@@ -332,11 +332,10 @@ class Look:
         controls = snapshot.controls(0)
         self._diffuse, self._specular = controls.diffuse, controls.specular
         self._seed, self._share_rays, self._turn = seed, share_rays, turn
-        # What points of a rectangle bring differs little beside the noise of shadows that rays are shared for.
-        is_ball = _is_ball(shining.form)
-        self._form = _NO_FORM if share_rays and not is_ball else shining.form
-        # A ball hides half of its points; of others few are enough where the whole is known.
-        is_few = not is_ball and (share_rays or len(shining.form) > 0)
+        # A ball hides half of its points; what those of a rectangle bring differs little beside the noise of shadows
+        # that rays are shared for.
+        is_few = share_rays and not _is_ball(shining.form)
+        self._form = _NO_FORM if is_few else shining.form
         self._groups = shining.groups(_FEW_CANDIDATES if is_few else _CANDIDATES, turn)
         self._through = np.empty(0 if shadows.passing is None else places.n, np.int32)
         self._phase, self._known = -1, np.full(0 if controls.shaping is None else places.n, -1, np.int16)

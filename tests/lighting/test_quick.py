@@ -447,3 +447,23 @@ def test_lights_without_a_form_look_as_they_do_by_their_points(name: str, share_
         shining = shining_points(snapshot, 7, by_form=whole)
         direct_at(snapshot, shadows, places, 7, share_rays, looks[-1], shining=shining)
     np.testing.assert_array_equal(*looks)
+
+
+def test_a_rectangle_that_is_partly_hidden_next_to_places_brings_what_its_points_do() -> None:
+    """Few points say too little of how much of it is hidden: near ones bring a hundred times what far ones do."""
+    upright = translation(0.0, 0.12, 0.0) @ rotation((0, 1, 0), 90)
+    light = Light(LightKind.RECT, (3, 2, 1), upright[:3], (2.0, 0.1))
+    screen = quads([[[-0.05, 0, -0.2], [-0.05, 1, -0.2], [-0.05, 1, 2], [-0.05, 0, 2]]])
+    snapshot = make_snapshot(
+        [Mesh(quad(3.0), Material(0.5), path="/floor"), Mesh(screen, Material(0.5))], lights=[light]
+    )
+    points = on_floor(snapshot, 20_000)
+    shadows = build_shadows(snapshot, tracer_of(snapshot))
+    places = prepare_places(snapshot, points, points.albedo, None)
+    expected = rounds(snapshot, points, None, 256).sum()
+    total, look = 0.0, np.empty((20_000, 3), np.float32)
+    shining = shining_points(snapshot, 7, by_form=True)
+    for turn in range(16):
+        direct_at(snapshot, shadows, places, 7, False, look, turn, shining=shining)
+        total += look.sum(dtype=np.float64) / 16
+    assert total == pytest.approx(expected, rel=0.01)
