@@ -10,16 +10,7 @@ import numpy as np
 from icheat_usd.kernels._jit import kernel
 from icheat_usd.kernels.clear_light import BALL, clear_light
 from icheat_usd.kernels.lanes import minus, ratio, root, store_whole, where_above
-from icheat_usd.kernels.place_columns import (
-    ALPHA,
-    COSINE,
-    EYE,
-    LAMBDA,
-    NORMAL,
-    ORIGIN,
-    RUN,
-    SHADING,
-)
+from icheat_usd.kernels.place_columns import ALPHA, COSINE, EYE, LAMBDA, NORMAL, ORIGIN, RUN, SHADING
 from icheat_usd.kernels.simd import load, multiply_add, plus, product, spread, store, zeros
 
 POINT = 7  #: columns of the table of points that are looked at for every place
@@ -55,7 +46,7 @@ def look(
     none, total = zeros(), zeros()
     is_ball = len(form) > 0 and form[0] == BALL
     clear = clear_light(form, at, lane) if is_ball else zeros()
-    inverse = ratio(spread(_ONE), clear)
+    inverse = ratio(spread(_ONE), clear) if is_ball else zeros()
     for c in range(candidates):
         point, kept = points + (c * POINT * width + lane) * 4, room + c * CANDIDATE * 4
         dx, dy, dz, power = load(point), load(point + step), load(point + 2 * step), load(point + 6 * step)
@@ -72,8 +63,8 @@ def look(
             )
             square = multiply_add(dx, dx, multiply_add(dy, dy, product(dz, dz)))
             weight = product(ratio(product(here, minus(none, away)), product(square, square)), power)
-            # Where it is known what all of the light brings, some point is looked at in any case.
-            rim = where_above(clear, none, product(weight, spread(_RIM)), none)
+            # Where it is known what all of a ball brings, some point is looked at in any case.
+            rim = where_above(clear, none, product(weight, spread(_RIM)), none) if is_ball else none
             weight = where_above(none, away, weight, rim)
         above = multiply_add(dx, gx, multiply_add(dy, gy, product(dz, gz)))
         weight = where_above(here, none, where_above(above, none, weight, none), none)

@@ -213,11 +213,11 @@ class LiveFrames:
     def _leave_others(self) -> None:
         """What shows other frames than that at the playhead needs nothing that is for lights in motion alone."""
         here = self.resident.get(self.resident.playhead)
+        shown = None if here is None else here.evaluator
         for number in self.resident.frames():
             frame = self.resident.get(number)
-            if frame is None or frame.evaluator is None or (here is not None and frame.evaluator is here.evaluator):
-                continue
-            frame.evaluator.leave()
+            if frame is not None and frame.evaluator not in (None, shown):
+                frame.evaluator.leave()
 
     def _read_stack(self, snapshot: SceneSnapshot) -> EditStack:
         surfaces = {surface.path for surface in snapshot.surfaces}
