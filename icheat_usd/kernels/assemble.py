@@ -17,6 +17,7 @@ from icheat_usd.kernels.simd import (
     load,
     load_byte,
     load_color,
+    load_number,
     load_rgb,
     multiply_add,
     plus,
@@ -31,6 +32,8 @@ from icheat_usd.kernels.simd import (
 )
 
 _CHUNK = 1024  # pixels or view samples: what is between two passes over them stays in the first-level cache
+_FILM_CHUNK = 4096  # of a film, where what begins a chunk takes longer than a pass that the second-level cache feeds
+_RUN = 64  # pixels that are looked at together for whether each has one sample
 
 
 class _Places(NamedTuple):
@@ -42,26 +45,36 @@ class _Places(NamedTuple):
     lobe: int
 
 
+class _Again(NamedTuple):
+    """The same of what first groups of view samples have again."""
+
+    begin: int
+    tint: int
+    lobe: int
+
+
 @kernel
 def _places(row, weight, tint, lobe):  # type: ignore[no-untyped-def]
     return _Places(address_of(row), address_of(weight), address_of(tint), address_of(lobe))
 
 
 @kernel
-def _blend_run(at, again_begin, again_tint, again_lobe, products, step, first, n, out):  # type: ignore[no-untyped-def]
+def _blend_run(at, again, products, step, first, n, out):  # type: ignore[no-untyped-def]
     """Light of the first groups of `n` view samples, three floats each; one more is written."""
     row, weight, tint, lobe = at.row + 16 * first, at.weight + 16 * first, at.tint + 16 * first, at.lobe + first
-    begin = np.int64(again_begin[first])
-    tint_again, lobe_again = address_of(again_tint) + 16 * begin, address_of(again_lobe) + begin
-    for i in range(first, first + n):
-        weights = load_color(weight)
-        light = weighted_sum(products + load_byte(lobe) * step, row, weights)
-        light = color_product(light, load_color(tint))
-        for _ in range(again_begin[i + 1] - again_begin[i]):
+    begin = again.begin + 4 * first
+    k = load_number(begin)
+    tint_again, lobe_again = again.tint + 16 * k, again.lobe + k
+    for _ in range(n):
+        begin += 4
+        end, weights = load_number(begin), load_color(weight)
+        light = color_product(weighted_sum(products + load_byte(lobe) * step, row, weights), load_color(tint))
+        while k < end:
             more = weighted_sum(products + load_byte(lobe_again) * step, row, weights)
             light = color_add(more, load_color(tint_again), light)
             tint_again += 16
             lobe_again += 1
+            k += 1
         store_color(out, light)
         row += 16
         weight += 16
@@ -89,7 +102,8 @@ def _indirect_run(first, n, table, products, out):  # type: ignore[no-untyped-de
         return
     start, step = address_of(products), 16 * products.shape[1]  # from lobe to lobe
     places = _places(row, weight, tint, lobe)
-    _blend_run(places, again_begin, again_tint, again_lobe, start, step, first, n, out)
+    again = _Again(address_of(again_begin), address_of(again_tint), address_of(again_lobe))
+    _blend_run(places, again, start, step, first, n, out)
     more = _places(more_row, more_weight, more_tint, more_lobe)
     for i in range(np.searchsorted(more_view, first), np.searchsorted(more_view, first + n)):
         _add_group(more, i, start, step, out + 12 * (np.int64(more_view[i]) - first))
@@ -197,10 +211,10 @@ def _add_direct(first, n, direct, indirect, out):  # type: ignore[no-untyped-def
 
 @kernel
 def _dim(first, n, dimmed_view, throughput, sent):  # type: ignore[no-untyped-def]
-    """Multiply the light `sent` (n, 3) of view samples with their throughput."""
+    """Multiply the light of `n` view samples, at an address, with their throughput."""
     for k in range(np.searchsorted(dimmed_view, first), np.searchsorted(dimmed_view, first + n)):
-        for c in range(3):
-            sent[dimmed_view[k] - first, c] *= throughput[k, c]
+        place = sent + 12 * (np.int64(dimmed_view[k]) - first)
+        store_rgb(place, color_product(load_rgb(place), load_rgb(address_of(throughput) + 12 * k)))
 
 
 @kernel
@@ -233,34 +247,39 @@ def sum_scaled(values, gains, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sum_samples(begin, end, sample_begin, sent, film):  # type: ignore[no-untyped-def]
-    """Pixels ``begin:end`` as sums of their samples, at addresses; `sent` is that of the first one's."""
+    """Pixels ``begin:end`` as sums of their samples; at addresses, those of the first."""
     for p in range(begin, end):
         total = black()
         for _ in range(sample_begin[p], sample_begin[p + 1]):
             total = scale_add(load_rgb(sent), np.float32(1.0), total)
             sent += 12
-        store_rgb(film + 12 * p, total)
+        store_rgb(film, total)
+        film += 12
 
 
 @kernel
-def _film_chunk(begin, end, table, products, own, direct, seen, in_order, film):  # type: ignore[no-untyped-def]
+def _film_chunk(begin, end, table, products, own, direct, seen, film):  # type: ignore[no-untyped-def]
     own_view, added_view, own_light = own
-    dimmed_view, throughput, sample_begin, _, still_pixel, still = seen
-    base = address_of(film)
+    dimmed_view, throughput, sample_begin, in_order, still_pixel, still = seen
     first = np.int64(sample_begin[begin])
     n = np.int64(sample_begin[end]) - first
     buffer = np.empty(3 * n + 1, np.float32)
-    indirect = address_of(buffer)
+    indirect, place = address_of(buffer), address_of(film) + 12 * begin
     _indirect_run(first, n, table, products, indirect)
     _replace_run(first, n, own_view, own_light, buffer[: 3 * n].reshape(n, 3))
     _add_run(first, n, added_view, own_light, buffer[: 3 * n].reshape(n, 3))
-    if in_order:
-        _add_direct(first, n, direct, indirect, base + 12 * begin)
-        _dim(first, n, dimmed_view, throughput, film[begin:end])
-    else:
-        _add_direct(first, n, direct, indirect, indirect)
-        _dim(first, n, dimmed_view, throughput, buffer[: 3 * n].reshape(n, 3))
-        _sum_samples(begin, end, sample_begin, indirect, base)
+    is_dimmed = np.searchsorted(dimmed_view, first) < np.searchsorted(dimmed_view, first + n)
+    for p in range(begin, end, _RUN):
+        last, v = min(p + _RUN, end), np.int64(sample_begin[p])
+        n_run = np.int64(sample_begin[last]) - v
+        some = place if in_order[p // _RUN] else indirect
+        _add_direct(v, n_run, direct, indirect, some)
+        if is_dimmed:
+            _dim(v, n_run, dimmed_view, throughput, some)
+        if not in_order[p // _RUN]:
+            _sum_samples(p, last, sample_begin, indirect, place)
+        place += 12 * _RUN
+        indirect += 12 * n_run
     buffer[0] = np.float32(0.0)  # keeps it, see `_sum_run`
     _add_still(begin, end, still_pixel, still, film)
 
@@ -274,10 +293,10 @@ def _add_still(begin, end, still_pixel, still, film):  # type: ignore[no-untyped
         store_rgb(place, scale_add(load_rgb(address_of(still) + 12 * s), np.float32(1.0), load_rgb(place)))
 
 
-def chunks_in_order(sample_begin: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """In which of the pieces that `assemble_film` makes of an image each pixel has one view sample."""
+def runs_in_order(sample_begin: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """In which runs of `_RUN` pixels each has one view sample: what they sum up is what `assemble_film` shows."""
     single = np.diff(sample_begin) == 1
-    return np.array([single[first : first + _CHUNK].all() for first in range(0, len(single), _CHUNK)], np.bool_)
+    return np.array([single[begin : begin + _RUN].all() for begin in range(0, len(single), _RUN)], np.bool_)
 
 
 @parallel_kernel
@@ -295,7 +314,7 @@ def assemble_film(table, products, own, direct, seen, film):  # type: ignore[no-
     seen
         ``(dimmed_view, throughput, sample_begin, in_order, still_pixel, still)``: (n_dimmed,) int32 view samples,
         ascending, whose throughput is not 1, and theirs, (n_dimmed, 3); the first view sample of each pixel,
-        (n_pixels + 1,) int32; `chunks_in_order`; and pixels that emit or show the background, (n_still,) int32
+        (n_pixels + 1,) int32; `runs_in_order`; and pixels that emit or show the background, (n_still,) int32
         ascending, each once, with what they add, (n_still, 3).
     film : (n_pixels, 3) float32
 
@@ -305,10 +324,9 @@ def assemble_film(table, products, own, direct, seen, film):  # type: ignore[no-
     once, at the end: packed rows and edits that take light away may say less.
     """
     n = len(film)
-    in_order = seen[3]
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        begin = chunk * _CHUNK
-        _film_chunk(begin, min(n, begin + _CHUNK), table, products, own, direct, seen, in_order[chunk], film)
+    for chunk in prange((n + _FILM_CHUNK - 1) // _FILM_CHUNK):
+        begin = chunk * _FILM_CHUNK
+        _film_chunk(begin, min(n, begin + _FILM_CHUNK), table, products, own, direct, seen, film)
 
 
 @kernel

@@ -147,3 +147,12 @@ def take_noise(row, runs, rest, noise, usual, smooths, look):  # type: ignore[no
         flat, sums = np.empty(3 * RUN, np.float32), np.empty((6, _GROUPS), np.float32)
         for k in range(piece * _PIECE, min((piece + 1) * _PIECE, len(runs))):
             _take_run(row, np.int64(runs[k]) * RUN, rest[k], noise[k], usual, smooths, flat, sums, look)
+
+
+@kernel
+def sum_of_some(values: np.ndarray, step: int) -> float:
+    """Sum of every `step`-th of some colours, all channels together."""
+    total = 0.0
+    for i in range(0, len(values), step):
+        total += np.float64(values[i, 0]) + np.float64(values[i, 1]) + np.float64(values[i, 2])
+    return total

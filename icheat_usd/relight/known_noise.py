@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icheat_usd.kernels.known_noise import take_noise
+from icheat_usd.kernels.known_noise import sum_of_some, take_noise
 from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.scene import F32, I32
 
@@ -38,16 +38,12 @@ class KnownNoise:
         of_all = OF_ALL**2 * of_light.sum() / max(len(of_light), 1)
         some = np.flatnonzero(of_noise > least**2 * (of_light + of_all))
         self._runs, self._light, self._noise = some.astype(np.int32), light[some], noise[some]
-        self._total = _sum(known)
+        self._total = sum_of_some(known, _ASKED)
 
     def take_from(self, look: F32) -> None:
         """Take from a look near the known one, (n, 3) by point, what noise the two have in common."""
-        usual = _sum(look) / self._total if self._total > 0 else 1.0
+        usual = sum_of_some(look, _ASKED) / self._total if self._total > 0 else 1.0
         take_noise(self._row, self._runs, self._light, self._noise, usual, self._smooths, look)
-
-
-def _sum(values: F32) -> float:
-    return float(values[::_ASKED].sum(dtype=np.float64))
 
 
 def _in_runs(values: F32) -> F32:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icheat_usd.kernels import version_products as kernels
-from icheat_usd.kernels.assemble import assemble_film, assemble_view, chunks_in_order
+from icheat_usd.kernels.assemble import assemble_film, assemble_view, runs_in_order
 from icheat_usd.kernels.film_table import FilmTable
 from icheat_usd.relight.direct_sum import SummedLight
 from icheat_usd.relight.groups import SampleGroups, TermTable
@@ -47,7 +47,7 @@ def seen_samples(view: ViewSamples) -> SeenSamples:
     shown = np.flatnonzero(still.any(axis=1)).astype(np.int32)
     dimmed = np.flatnonzero((view.throughput != 1).any(axis=1)).astype(np.int32)
     throughput = np.ascontiguousarray(view.throughput[dimmed], np.float32)
-    return SeenSamples(dimmed, throughput, begin, chunks_in_order(begin), shown, np.ascontiguousarray(still[shown]))
+    return SeenSamples(dimmed, throughput, begin, runs_in_order(begin), shown, np.ascontiguousarray(still[shown]))
 
 
 class SharedLight:

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.assemble import assemble_film, assemble_view, chunks_in_order, sum_films, sum_scaled
+from icheat_usd.kernels.assemble import assemble_film, assemble_view, runs_in_order, sum_films, sum_scaled
 from icheat_usd.kernels.film_table import FilmTable, film_table
 from icheat_usd.relight.direct_sum import DirectSum
 from icheat_usd.scene import F32, F64, I32
@@ -65,10 +65,11 @@ def test_no_lobes_give_no_light() -> None:
 @pytest.mark.parametrize("samples", ["one", "varied"])
 def test_film_adds_direct_light_and_what_stays(samples: str, n_kept: int) -> None:
     rng = np.random.default_rng(3)
-    n_pixels = 4500
+    n_pixels = 9050
     per_pixel = np.ones(n_pixels, np.int64)
-    if samples == "varied":
-        per_pixel[1024:] = rng.integers(0, 4, n_pixels - 1024)
+    if samples == "varied":  # single ones at first and, of samples that no longer have their pixels' numbers, behind
+        for some in (slice(1030, 3000), slice(7000, None)):
+            per_pixel[some] = rng.integers(0, 4, len(per_pixel[some]))
     pixel = np.repeat(np.arange(n_pixels), per_pixel).astype(np.int32)
     n = len(pixel)
     rows = interpolation(rng.integers(1, 9, n).astype(np.int32))
@@ -101,7 +102,7 @@ def test_film_adds_direct_light_and_what_stays(samples: str, n_kept: int) -> Non
             numba.set_num_threads(n_threads)
             film = np.full((n_pixels, 3), np.nan, np.float32)
             edited = (own_view, added_view, own)
-            seen = (dimmed_view, throughput[dimmed_view], begin, chunks_in_order(begin), still_pixel, still)
+            seen = (dimmed_view, throughput[dimmed_view], begin, runs_in_order(begin), still_pixel, still)
             assemble_film(tuple(table_of(rows, tint)), products, edited, summed, seen, film)
             films.append(film)
     finally:
@@ -134,7 +135,7 @@ def test_what_is_kept_of_direct_light_does_not_show_in_the_bits() -> None:
     direct, gains = colors(4, 2500, 3), colors(4, 3)
     nothing = np.zeros(0, np.int32)
     begin = np.arange(2501, dtype=np.int32)
-    seen = (nothing, np.zeros((0, 3), np.float32), begin, chunks_in_order(begin), nothing, np.zeros((0, 3), np.float32))
+    seen = (nothing, np.zeros((0, 3), np.float32), begin, runs_in_order(begin), nothing, np.zeros((0, 3), np.float32))
     own = (nothing, nothing, np.zeros((0, 3), np.float32))
     rows, tint = interpolation(np.full(2500, 3, np.int32)), colors(1, 2500, 3)
     table, products = tuple(table_of(rows, tint)), colors(1, N_ROWS, 4)

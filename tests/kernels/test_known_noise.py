@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.known_noise import take_noise
+from icheat_usd.kernels.known_noise import sum_of_some, take_noise
 from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.scene import F32, F64
 
@@ -139,3 +139,9 @@ def test_any_number_of_threads_makes_the_same_bits():
     finally:
         numba.set_num_threads(most)
     np.testing.assert_array_equal(taken(look, rest, noise, 1.0, True), one)
+
+
+@pytest.mark.parametrize("n", [0, 1, 16, 1000])
+def test_some_colours_are_summed(n: int) -> None:
+    values = np.random.default_rng(n).random((n, 3), np.float32)
+    assert sum_of_some(values, 16) == pytest.approx(values[::16].sum(dtype=np.float64), rel=1e-12)

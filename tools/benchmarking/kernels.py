@@ -20,7 +20,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from icheat_usd.kernels.assemble import assemble_film, chunks_in_order, sum_scaled
+from icheat_usd.kernels.assemble import assemble_film, runs_in_order, sum_scaled
 from icheat_usd.kernels.film_table import film_table
 from icheat_usd.kernels.large_terms import multiply_terms
 from icheat_usd.kernels.packed import LANES, multiply_tiles
@@ -359,7 +359,7 @@ def measure_frame(
     background = np.ascontiguousarray(view.background[still])
     film = np.empty((n_pixels, 3), np.float32)
     unedited = (np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32))
-    seen = (dimmed, view.throughput[dimmed], sample_begin, chunks_in_order(sample_begin), still, background)
+    seen = (dimmed, view.throughput[dimmed], sample_begin, runs_in_order(sample_begin), still, background)
 
     def haar() -> None:
         haar_of_versions(plan, values, products[0].coefficients)
