@@ -247,7 +247,7 @@ def sum_scaled(values, gains, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sum_samples(begin, end, sample_begin, sent, film):  # type: ignore[no-untyped-def]
-    """Pixels ``begin:end`` as sums of their samples; at addresses, those of the first."""
+    """Pixels ``begin:end`` as sums of their samples; `sent` and `film` are addresses, of the first of each."""
     for p in range(begin, end):
         total = black()
         for _ in range(sample_begin[p], sample_begin[p + 1]):
@@ -294,7 +294,7 @@ def _add_still(begin, end, still_pixel, still, film):  # type: ignore[no-untyped
 
 
 def runs_in_order(sample_begin: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """In which runs of `_RUN` pixels each has one view sample: what they sum up is what `assemble_film` shows."""
+    """In which runs of `_RUN` pixels each has one view sample, whose light goes straight to the film."""
     single = np.diff(sample_begin) == 1
     return np.array([single[begin : begin + _RUN].all() for begin in range(0, len(single), _RUN)], np.bool_)
 
