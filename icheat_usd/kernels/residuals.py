@@ -7,6 +7,9 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 
+#: Sums that are made side by side, of 16 colours: one of all would wait for every addition.
+_SUMS = 48
+
 
 @kernel
 def _add_scaled(lost, factor, out):  # type: ignore[no-untyped-def]
@@ -56,53 +59,58 @@ def add_light_residuals(lost, factors, n_tiles, out):  # type: ignore[no-untyped
 
 @kernel
 def _piece_products(now, before, out):  # type: ignore[no-untyped-def]
-    """Sums over cells of ``now * before`` and ``before * before``, channel by channel, to `out` (6,)."""
-    r = g = b = rr = gg = bb = 0.0
-    for k in range(len(now)):
-        x, y, z = np.float64(before[k, 0]), np.float64(before[k, 1]), np.float64(before[k, 2])
-        r += np.float64(now[k, 0]) * x
-        g += np.float64(now[k, 1]) * y
-        b += np.float64(now[k, 2]) * z
-        rr += x * x
-        gg += y * y
-        bb += z * z
-    out[0], out[1], out[2], out[3], out[4], out[5] = r, g, b, rr, gg, bb
+    """Sums over cells of ``now * before`` and ``before * before``, channel by channel, to `out` (6,).
+
+    Colours come one after the other, flat.
+    """
+    both, squared = np.zeros((2, _SUMS))
+    whole = len(now) // _SUMS * _SUMS
+    for first in range(0, whole, _SUMS):
+        a, b = now[first : first + _SUMS], before[first : first + _SUMS]
+        for i in range(_SUMS):
+            both[i] += np.float64(a[i]) * np.float64(b[i])
+            squared[i] += np.float64(b[i]) * np.float64(b[i])
+    for k in range(whole, len(now)):
+        both[k - whole] += np.float64(now[k]) * np.float64(before[k])
+        squared[k - whole] += np.float64(before[k]) * np.float64(before[k])
+    out[:] = 0.0
+    for i in range(_SUMS):
+        out[i % 3] += both[i]
+        out[3 + i % 3] += squared[i]
 
 
 @kernel
 def _take_proportional(now, before, factor, rest, size):  # type: ignore[no-untyped-def]
-    # Of each channel by itself: one sum of all would wait for every addition.
-    left_r = left_g = left_b = whole_r = whole_g = whole_b = np.float32(0)
-    of_left_r = of_left_g = of_left_b = of_whole_r = of_whole_g = of_whole_b = 0.0
-    fr, fg, fb = factor[0], factor[1], factor[2]
-    for k in range(len(now)):
-        r, g, b = now[k, 0], now[k, 1], now[k, 2]
-        x, y, z = r - fr * before[k, 0], g - fg * before[k, 1], b - fb * before[k, 2]
-        rest[k, 0], rest[k, 1], rest[k, 2] = x, y, z
-        left_r, left_g, left_b = max(left_r, abs(x)), max(left_g, abs(y)), max(left_b, abs(z))
-        whole_r, whole_g, whole_b = max(whole_r, abs(r)), max(whole_g, abs(g)), max(whole_b, abs(b))
-        of_left_r += np.float64(x) * np.float64(x)
-        of_left_g += np.float64(y) * np.float64(y)
-        of_left_b += np.float64(z) * np.float64(z)
-        of_whole_r += np.float64(r) * np.float64(r)
-        of_whole_g += np.float64(g) * np.float64(g)
-        of_whole_b += np.float64(b) * np.float64(b)
-    size[0], size[1] = max(left_r, left_g, left_b), max(whole_r, whole_g, whole_b)
-    size[2], size[3] = of_left_r + of_left_g + of_left_b, of_whole_r + of_whole_g + of_whole_b
+    """What is left of colours, which come one after the other, flat, and how large it is."""
+    factors, (left, whole) = np.empty(_SUMS, np.float32), np.zeros((2, _SUMS), np.float32)
+    of_left, of_whole = np.zeros((2, _SUMS))
+    for i in range(_SUMS):
+        factors[i] = factor[i % 3]
+    for first in range(0, len(now), _SUMS):
+        n = min(_SUMS, len(now) - first)
+        a, b, c = now[first : first + n], before[first : first + n], rest[first : first + n]
+        for i in range(n):
+            c[i] = a[i] - factors[i] * b[i]
+        for i in range(n):
+            left[i], whole[i] = max(left[i], abs(c[i])), max(whole[i], abs(a[i]))
+            of_left[i] += np.float64(c[i]) * np.float64(c[i])
+            of_whole[i] += np.float64(a[i]) * np.float64(a[i])
+    size[0], size[1], size[2], size[3] = left.max(), whole.max(), of_left.sum(), of_whole.sum()
 
 
 @parallel_kernel
 def _find_products(pieces, now, before, sums):  # type: ignore[no-untyped-def]
     for p in prange(len(pieces)):
         some = slice(pieces[p, 1], pieces[p, 2])
-        _piece_products(now[some], before[some], sums[p])
+        _piece_products(now[some].reshape(-1), before[some].reshape(-1), sums[p])
 
 
 @parallel_kernel
 def _find_rest(pieces, now, before, factors, rest, sizes):  # type: ignore[no-untyped-def]
     for p in prange(len(pieces)):
         some = slice(pieces[p, 1], pieces[p, 2])
-        _take_proportional(now[some], before[some], factors[pieces[p, 0]], rest[some], sizes[p])
+        colors = now[some].reshape(-1), before[some].reshape(-1)
+        _take_proportional(*colors, factors[pieces[p, 0]], rest[some].reshape(-1), sizes[p])
 
 
 def in_lanes(colors):  # type: ignore[no-untyped-def]

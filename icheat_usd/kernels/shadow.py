@@ -30,7 +30,7 @@ from icheat_usd.kernels.embree import PACKET, call_packet
 from icheat_usd.kernels.lanes import minus, where_above
 from icheat_usd.kernels.place_columns import COLUMNS, EDGE, ORIGIN, RUN, SPECULAR, TINT
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
-from icheat_usd.kernels.shadow_lanes import CANDIDATE, look, shine
+from icheat_usd.kernels.shadow_lanes import CANDIDATE, keep_near_boxes, look, shine
 from icheat_usd.kernels.simd import address_of, fetch, load, multiply_add, plus, product, spread, store, zeros
 
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
@@ -91,9 +91,9 @@ def _prepare_packet(rays: np.ndarray) -> None:
 
 @kernel
 def _trace(
-    function: int, arguments: int, opaque: int, passing: int, distant: bool, columns: np.ndarray, column: np.ndarray,
-    runs: np.ndarray, found: np.ndarray, rays: np.ndarray, valid: np.ndarray, rows: np.ndarray, n: int,
-    state: np.ndarray,
+    function: int, arguments: int, opaque: int, passing: int, boxes: np.ndarray, distant: bool, columns: np.ndarray,
+    column: np.ndarray, runs: np.ndarray, found: np.ndarray, rays: np.ndarray, valid: np.ndarray, rows: np.ndarray,
+    n: int, state: np.ndarray,
 ) -> None:  # fmt: skip
     """Shadow rays of the first `n` rows of some runs, in packets of 16; their `state` is set."""
     limit = np.float32(np.inf) if distant else _STOP_SHORT
@@ -113,6 +113,8 @@ def _trace(
             continue
         for lane in range(count):
             valid[lane] = -1 if rays[8, lane] >= _ZERO else 0
+        if not keep_near_boxes(boxes, rays, valid):
+            continue
         call_packet(function, address_of(valid), passing, address_of(rays), arguments)
         for lane in range(count):
             if valid[lane] != 0 and rays[8, lane] < _ZERO:
@@ -216,16 +218,16 @@ def _append_rows(asks: np.ndarray, offset: int, count: int, rows: np.ndarray) ->
 
 @kernel
 def _meet(
-    function: int, arguments: int, opaque: int, passing: int, distant: bool, columns: np.ndarray, column: np.ndarray,
-    runs: np.ndarray, found: np.ndarray, rays: np.ndarray, valid: np.ndarray, chosen: np.ndarray, share_rays: bool,
-    phase: int, known: np.ndarray, told: np.ndarray, state: np.ndarray,
+    function: int, arguments: int, opaque: int, passing: int, boxes: np.ndarray, distant: bool, columns: np.ndarray,
+    column: np.ndarray, runs: np.ndarray, found: np.ndarray, rays: np.ndarray, valid: np.ndarray, chosen: np.ndarray,
+    share_rays: bool, phase: int, known: np.ndarray, told: np.ndarray, state: np.ndarray,
 ) -> None:  # fmt: skip
     """Find what is between the places of some runs and their points, `chosen` (n_runs, RUN)."""
     n = len(runs)
     asks, begin = np.empty((n, RUN), np.int32), np.zeros(n + 1, np.int64)
     rows, others = np.empty(n * RUN + 1, np.int32), np.empty(n * RUN + 1, np.int32)
     every_state, alike = state.reshape(-1), np.empty(n, np.int64)
-    way = function, arguments, opaque, passing, distant, columns, column, runs, found, rays, valid
+    way = function, arguments, opaque, passing, boxes, distant, columns, column, runs, found, rays, valid
     for k in range(n):
         knows = known[runs[k] * RUN : (runs[k] + 1) * RUN]
         alike[k] = _alike(knows, told)
@@ -364,11 +366,11 @@ def _fetch_columns(columns: int, column: np.ndarray, run: int, other: int, first
 
 @kernel
 def _light_runs(
-    function: int, arguments: int, opaque: int, passing: int, points: np.ndarray, first_point: np.ndarray,
-    colors: np.ndarray, form: np.ndarray, light: np.ndarray, distant: bool, seed: int, turn: int, bounds: np.ndarray,
-    columns: np.ndarray, column: np.ndarray, lobes: np.ndarray, diffuse: np.float32, specular: np.float32,
-    share_rays: bool, phase: int, known: np.ndarray, told: np.ndarray, row: np.ndarray, wanted: np.ndarray,
-    out: np.ndarray, through: np.ndarray, first: int, last: int,
+    function: int, arguments: int, opaque: int, passing: int, boxes: np.ndarray, points: np.ndarray,
+    first_point: np.ndarray, colors: np.ndarray, form: np.ndarray, light: np.ndarray, distant: bool, seed: int,
+    turn: int, bounds: np.ndarray, columns: np.ndarray, column: np.ndarray, lobes: np.ndarray, diffuse: np.float32,
+    specular: np.float32, share_rays: bool, phase: int, known: np.ndarray, told: np.ndarray, row: np.ndarray,
+    wanted: np.ndarray, out: np.ndarray, through: np.ndarray, first: int, last: int,
 ) -> None:  # fmt: skip
     """`light_places` for those runs that are `wanted` from number `first` up to `last`."""
     n, candidates, width = last - first, points.shape[0], points.shape[2]
@@ -418,7 +420,7 @@ def _light_runs(
             chosen[k, j] = first_point[offset + j] + chosen[k, j] if chosen[k, j] >= 0 else -1
         chosen[k, size:] = -1
     _meet(
-        function, arguments, opaque, passing, distant, columns, column, runs[:n], found, rays, valid, chosen,
+        function, arguments, opaque, passing, boxes, distant, columns, column, runs[:n], found, rays, valid, chosen,
         share_rays, phase, known, told, state,
     )  # fmt: skip
     for k in range(n):
@@ -450,6 +452,7 @@ def light_places(
     arguments: int,
     opaque: int,
     passing: int,
+    boxes: np.ndarray,
     points: np.ndarray,
     first_point: np.ndarray,
     colors: np.ndarray,
@@ -482,6 +485,8 @@ def light_places(
     function, opaque, passing : addresses of rtcOccluded16 and of the scenes of opaque and of see-through triangles
         (0: there are none)
     arguments : address of RTCOccludedArguments, or 0
+    boxes : (n, 6) float32
+        Least and largest corners of boxes around all see-through triangles: rays past these are not traced to them.
     points : (candidates, `POINT`, n_groups + `RUN`) float32
         Groups of so many points of the light as each place looks at: place, normal, and radiance times the whole
         light's area. Distant lights: directions, and radiance times solid angle; those without an angle: irradiance
@@ -528,7 +533,7 @@ def light_places(
         turn_of = np.int64(i)
         task = 2 * turn_of if turn_of < half else 2 * (turn_of - half) + 1
         _light_runs(
-            function, arguments, opaque, passing, points, first_point, colors, form, light, distant, seed, turn, bounds,
-            columns, column, lobes, diffuse, specular, share_rays, phase, known, told, row, wanted, out, through,
-            task * _RUNS, min(n_runs, (task + 1) * _RUNS),
+            function, arguments, opaque, passing, boxes, points, first_point, colors, form, light, distant, seed, turn,
+            bounds, columns, column, lobes, diffuse, specular, share_rays, phase, known, told, row, wanted, out,
+            through, task * _RUNS, min(n_runs, (task + 1) * _RUNS),
         )  # fmt: skip

@@ -11,12 +11,12 @@ from icheat_usd.kernels._jit import kernel
 from icheat_usd.kernels.clear_light import BALL, clear_light
 from icheat_usd.kernels.lanes import minus, ratio, root, store_whole, where_above
 from icheat_usd.kernels.place_columns import ALPHA, COSINE, EYE, LAMBDA, NORMAL, ORIGIN, RUN, SHADING
-from icheat_usd.kernels.simd import load, multiply_add, plus, product, spread, store, zeros
+from icheat_usd.kernels.simd import address_of, load, load_spread, multiply_add, plus, product, spread, store, zeros
 
 POINT = 7  #: columns of the table of points that are looked at for every place
 #: Floats that `look` needs for each candidate of 16 places.
 CANDIDATE = 64
-_ONE = np.float32(1.0)
+_ONE, _TINY, _LATER = np.float32(1.0), np.float32(1e-30), np.float32(1.0 + 1e-5)
 # Weight of a point on the far side of a ball beside that of one at this side.
 _RIM = np.float32(-1e-3)
 
@@ -92,6 +92,57 @@ def look(
     total = product(total, spread(_ONE / np.float32(candidates)))
     store(out + RUN * 12, where_above(clear, none, clear, total))
     store_whole(choice_of + lane * 4, choice)
+
+
+@kernel
+def keep_near_boxes(boxes: np.ndarray, rays: np.ndarray, valid: np.ndarray) -> bool:
+    """Take those of a packet's rays from the `valid` ones that touch none of some boxes; whether any is left.
+
+    Boxes (n, 6) have their least and largest corners; rays are those of `kernels.embree`, up to their own limit.
+    """
+    start, none, one = address_of(rays), zeros(), spread(_ONE)
+    x, y, z = load(start), load(start + 64), load(start + 128)
+    # Where the way is next to none, it still has a side, and there is no 0 / 0.
+    ix = ratio(one, _not_none(load(start + 256)))
+    iy = ratio(one, _not_none(load(start + 320)))
+    iz = ratio(one, _not_none(load(start + 384)))
+    limit, later, touched = load(start + 512), spread(_LATER), zeros()
+    for b in range(len(boxes)):
+        box = address_of(boxes) + 24 * b
+        x0, x1 = _crossings(box, x, ix), _crossings(box + 12, x, ix)
+        y0, y1 = _crossings(box + 4, y, iy), _crossings(box + 16, y, iy)
+        z0, z1 = _crossings(box + 8, z, iz), _crossings(box + 20, z, iz)
+        near = _larger(_larger(none, _smaller(x0, x1)), _larger(_smaller(y0, y1), _smaller(z0, z1)))
+        far = _smaller(_smaller(limit, _larger(x0, x1)), _smaller(_larger(y0, y1), _larger(z0, z1)))
+        # Rounding moves what lies far away.
+        touched = where_above(near, product(far, later), touched, one)
+    touches, left = np.empty(16, np.int32), 0
+    store_whole(address_of(touches), touched)
+    for lane in range(16):
+        valid[lane] = valid[lane] if touches[lane] != 0 else 0
+        left |= valid[lane]
+    return left != 0
+
+
+@kernel
+def _not_none(way: Any) -> Any:
+    return where_above(product(way, way), spread(_TINY), way, spread(_TINY))
+
+
+@kernel
+def _crossings(side: int, origin: Any, inverse: Any) -> Any:
+    """Where rays cross the plane of a box's side, whose place is at an address."""
+    return product(minus(load_spread(side), origin), inverse)
+
+
+@kernel
+def _larger(a: Any, b: Any) -> Any:
+    return where_above(a, b, a, b)
+
+
+@kernel
+def _smaller(a: Any, b: Any) -> Any:
+    return where_above(b, a, a, b)
 
 
 @kernel

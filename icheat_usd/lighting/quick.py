@@ -16,6 +16,7 @@ from icheat_usd.kernels.place_columns import ALPHA, COLUMNS, RUN, SHADING, SPECU
 from icheat_usd.kernels.see_through import cross_layers, dim_places
 from icheat_usd.kernels.shadow import PART, SHARED_PART, STRIDE, TURNED, light_places, tell_points
 from icheat_usd.kernels.shaping import shape_places
+from icheat_usd.lighting.clear_boxes import boxes_around
 from icheat_usd.lighting.controls import darken, emission_frame, without
 from icheat_usd.lighting.points import light_form, light_points
 from icheat_usd.materials import is_glossy
@@ -30,6 +31,7 @@ _FEW_CANDIDATES = 2  # where places share rays
 _PIECE = 256  # runs of a look that a thread takes at a time
 _NO_POINTS = np.zeros(0, np.int32)
 _NO_FORM = np.zeros(0, np.float32)
+_NO_BOXES = np.zeros((0, 6), np.float32)
 # A point has turned if more than this share of the places that see it, now or before, met something else; what is said
 # of nearly all places may be wrong of so many; and from how many rays on either is said.
 _TURNED_SHARE, _ALL_BUT, _LEAST_LOOKS = 0.2, 0.03, 3
@@ -43,6 +45,7 @@ class Shadows:
 
     opaque: EmbreeTracer
     passing: EmbreeTracer | None  #: triangles that may let light through; None: there are none
+    boxes: F32  #: (n, 6) around these
 
     def crossing(self, snapshot: SceneSnapshot, origin: F32, direction: F32, limit: float) -> F32:
         """Share of light (n,) that crosses the see-through triangles up to `limit`; see `tracing.transmittance`."""
@@ -90,8 +93,9 @@ def build_shadows(snapshot: SceneSnapshot, tracer: EmbreeTracer, hidden: Bool | 
     if not passes.any():
         opaque = without(snapshot, tracer, hidden)
         assert isinstance(opaque, EmbreeTracer)
-        return Shadows(opaque, None)
-    return Shadows(_tracer_of(snapshot, ~passes, hidden), _tracer_of(snapshot, passes, hidden))
+        return Shadows(opaque, None, _NO_BOXES)
+    boxes = boxes_around(snapshot.geometry, passes, hidden)
+    return Shadows(_tracer_of(snapshot, ~passes, hidden), _tracer_of(snapshot, passes, hidden), boxes)
 
 
 def _tracer_of(snapshot: SceneSnapshot, kept: np.ndarray, hidden: Bool | None) -> EmbreeTracer:
@@ -364,6 +368,7 @@ class Look:
             shadows.opaque.compiled().arguments if self._share_rays else 0,
             opaque,
             passing,
+            shadows.boxes,
             groups.points,
             groups.first,
             groups.colors,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels import packing as kernels
 from icheat_usd.kernels.large_terms import copy_terms, find_large_terms
+from icheat_usd.kernels.least_term import least_term
 from icheat_usd.kernels.term_energy import STEPS, sum_energies
 from icheat_usd.samples import ClusterTree
 from icheat_usd.samples.wavelets import haar_forward
@@ -216,32 +217,13 @@ class LargeTerms:
         size : (n_leaves,) float32
             Largest size of each Haar coefficient of the light.
         """
-        return float(self._least(self._terms(size), max_bytes))
+        return self.least_of_error(size, -1.0, max_bytes)
 
     def least_of_error(self, size: F32, squared_error: float, max_bytes: int, share: float = 1.0) -> float:
         """The same, so that squares of smaller ones sum up to `squared_error` over all pixels, or as `least` has it.
 
         They sum up to no more than `share` of all squares but the roots'.
         """
-        terms = self._terms(size)
-        left_out = np.cumsum(np.square(terms, dtype=np.float64)) * (self.n_terms / max(len(terms), 1))
-        all_but_roots = float(left_out[len(self._index) - 1]) if len(self._index) else 0.0
-        n_left_out = int(np.searchsorted(left_out, min(squared_error, share * all_but_roots)))
-        by_error = terms[n_left_out] if n_left_out < len(terms) else np.inf
-        return float(max(by_error, self._least(terms, max_bytes)))
-
-    def _terms(self, size: F32) -> F32:
-        """Ascending; infinite ones stand for the roots."""
-        terms = np.full(len(self._index) + self._n_roots, np.inf, np.float32)
-        some = terms[: len(self._index)]
-        np.take(size, self._index, out=some, mode="clip")  # which does not copy
-        some *= self._worth
-        some.sort()
-        return terms
-
-    def _least(self, terms: F32, max_bytes: int) -> float:
-        """Of terms in ascending order."""
-        n_kept = round(len(terms) * max_bytes / (max(self.n_terms, 1) * _BYTES_OF_TERM))
-        if n_kept >= len(terms):
-            return 0.0
-        return float(terms[-n_kept]) if n_kept > 0 else np.inf
+        of_sample = max(len(self._index) + self._n_roots, 1) / max(self.n_terms, 1)
+        n_most = round(max_bytes * of_sample / _BYTES_OF_TERM) - self._n_roots
+        return float(least_term(self._index, self._worth, size, n_most, squared_error * of_sample, share))
