@@ -363,9 +363,11 @@ class Look:
         shadows, places, groups = self._shadows, self._places, self._groups
         function, opaque = shadows.opaque.address_of("rtcOccluded16")
         passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
+        # Rays of all places that lie together are alike; a part of them, or of places that share none, is not.
+        are_alike = self._share_rays and (every_ray or self._phase < 0)
         light_places(
             function,
-            shadows.opaque.compiled().arguments if self._share_rays else 0,
+            shadows.opaque.compiled().arguments if are_alike else 0,
             opaque,
             passing,
             shadows.boxes,

@@ -503,15 +503,19 @@ class LiveRelighter:
 
     def _multiply_light(self) -> None:
         """Unedited light, and beside it that of versions, which depends on how bright the image is."""
-        is_seen = Event()
+        is_seen, lights = Event(), self.lights
+        multiply: Callable[[], None]
+        # What comes before the products has all workers; beside others it would keep these waiting.
+        if self._narrow is not None:
+            rest = self._narrow.rest_of(lights.radiance, lights.gains)
+            multiply = partial(self._shared.set_unedited_near_rest, self._narrow, rest, is_seen.set)
+        else:
+            light = self._products.light_of(self._light())
+            multiply = partial(self._shared.set_unedited, light, is_seen.set)
 
         def unedited() -> None:
             try:
-                if self._narrow is not None:
-                    radiance, gains = self.lights.radiance, self.lights.gains
-                    self._shared.set_unedited_near_rest(self._narrow, radiance, gains, is_seen.set)
-                else:
-                    self._shared.set_unedited(self._light(), is_seen.set)
+                multiply()
             finally:
                 is_seen.set()
 

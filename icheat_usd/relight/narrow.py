@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,13 @@ from icheat_usd.transport.packed import LANES
 NARROW_BYTES = 6_000_000
 #: Cells of a light that are compared in one piece.
 _PIECE = 2048
+
+
+class Rest(NamedTuple):
+    """Lights of which some were at rest."""
+
+    light: F32 | None  #: what they are not like then, as `Products.light_of` has it; None: nothing is left
+    factors: F32  #: (n_known, 64) how much of each known light there is, in lanes
 
 
 class Narrow:
@@ -72,15 +80,30 @@ class Narrow:
         """Other edits are shown; `step` chooses anew what matters to them."""
         self._n_versions = -1
 
-    def unedited(self, radiance: F32, gains: F32, out: F32, seen: Callable[[], None] | None = None) -> None:
-        """Products of lights (n_lights, n_gather, 3) under gains into ``out[:, : n_tiles]``.
-
-        `seen` is called as by `Products.multiply_all`.
-        """
+    def rest_of(self, radiance: F32, gains: F32) -> Rest:
+        """What is to be multiplied of lights (n_lights, n_gather, 3) under gains; stays until the next call."""
         is_same = self._compare(radiance)
         factors = np.zeros((len(self._known), 4 * 16), np.float32)
         n = min(len(radiance), len(factors))
         factors[:n] = in_lanes(gains[:n])
+        if is_same.all() and len(is_same):
+            return Rest(None, factors)
+        moved = np.flatnonzero(~is_same).tolist()
+        rests = np.empty((len(moved), *radiance.shape[1:]), np.float32)
+        rest = np.empty(radiance.shape[1:], np.float32)
+        for i, light in enumerate(moved):
+            if light < n:
+                self._take_known(light, radiance[light], factors, rests[i])
+            else:
+                rests[i] = radiance[light]
+        sum_scaled(rests, np.ascontiguousarray(gains[moved], np.float32), rest)
+        return Rest(self._products.light_of(rest), factors)
+
+    def unedited(self, rest: Rest, out: F32, seen: Callable[[], None] | None = None) -> None:
+        """Products of the lights that `rest_of` was asked for into ``out[:, : n_tiles]``.
+
+        `seen` is called as by `Products.multiply_all`.
+        """
         n_tiles = self._exact.n_tiles
         every = np.arange(n_tiles, dtype=np.int32)
 
@@ -89,25 +112,16 @@ class Narrow:
             if len(tile) < n_tiles:
                 # An index would give the array another order in memory, and kernels were compiled for this one.
                 known = np.take(known, (np.arange(len(products))[:, None] * n_tiles + tile).ravel(), axis=1)
-            add_light_residuals(known, factors, len(tile), products.reshape(*products.shape[:2], 4 * LANES))
+            add_light_residuals(known, rest.factors, len(tile), products.reshape(*products.shape[:2], 4 * LANES))
 
-        if is_same.all() and len(is_same):
-            out[:, :n_tiles] = 0
-            add(out, every)
-            self._products.see(out, every)
-            if seen is not None:
-                seen()
-        else:
-            moved = np.flatnonzero(~is_same).tolist()
-            rests = np.empty((len(moved), *radiance.shape[1:]), np.float32)
-            rest = np.empty(radiance.shape[1:], np.float32)
-            for i, light in enumerate(moved):
-                if light < n:
-                    self._take_known(light, radiance[light], factors, rests[i])
-                else:
-                    rests[i] = radiance[light]
-            sum_scaled(rests, np.ascontiguousarray(gains[moved], np.float32), rest)
-            self._products.multiply_all(rest, out, add, seen)
+        if rest.light is not None:
+            self._products.multiply_all(rest.light, out, add, seen)
+            return
+        out[:, :n_tiles] = 0
+        add(out, every)
+        self._products.see(out, every)
+        if seen is not None:
+            seen()
 
     def products_of(self, light: int) -> F32:
         """Exact products of a light as it was at rest, (n_lobes, n_tiles, 64, 4)."""

@@ -397,14 +397,22 @@ class Products:
             self._multiply_floats(rows, values, tile, np.zeros_like(tile), out[lobe, first:end])
         return end
 
+    def light_of(self, b: F32) -> F32:
+        """Leaf values (n_leaves, 3) as `multiply_all` takes them, which stay until the next call: (1, n_leaves, 4)."""
+        if self._haar:
+            return haar_of_versions(self._plan, b[None], self._unedited)
+        values = np.zeros((1, self._n_leaves, 4), np.float32)
+        values[0, :, :3] = b
+        return values
+
     def multiply_all(
         self,
-        b: F32,
+        light: F32,
         out: F32,
         known: Callable[[F32, I32], None] | None = None,
         seen: Callable[[], None] | None = None,
     ) -> None:
-        """Products of all tiles with leaf values (n_leaves, 3) into ``out[:, : n_tiles]``.
+        """Products of all tiles with what `light_of` makes of some light, into ``out[:, : n_tiles]``.
 
         Of a large transport, only the terms that are large in this light are read; see `LEFT_OUT`.
 
@@ -416,29 +424,24 @@ class Products:
             Called, by a large transport alone, once `multiply` may be called for other light than before.
         """
         tile = np.arange(self.n_tiles, dtype=np.int32)
-        if not self._haar:
-            values = np.zeros((1, self._n_leaves, 4), np.float32)
-            values[0, :, :3] = b
-        else:
-            values = haar_of_versions(self._plan, b[None], self._unedited)
         tiles = self._tiles
         if tiles is None or self._large_terms is None:
             if tiles is None:
                 for lobe, rows in enumerate(self._rows):
-                    self._multiply_floats(rows, values, tile, 0 * tile, out[lobe, : self.n_tiles])
+                    self._multiply_floats(rows, light, tile, 0 * tile, out[lobe, : self.n_tiles])
             else:
-                tiles.multiply_one(values, _NONE, _NONE[0], out)
+                tiles.multiply_one(light, _NONE, _NONE[0], out)
             if known is not None:
                 known(out, tile)
             return
         size = np.empty((1, self._n_leaves), np.float32)
-        largest_channels(np.zeros(1, np.int64), values, size)
+        largest_channels(np.zeros(1, np.int64), light, size)
         size[0, 0] = np.inf  # means stay, however dark it is
         # How bright the image is follows from this light, not from the last frame: the same light, the same bits.
         step = max(1, len(tile) // _TILES_LOOKED_AT)
         some = tile[::step]
         looked_at = self.room(len(some))
-        tiles.multiply_one(values, _NONE, _NONE[0], looked_at, step)
+        tiles.multiply_one(light, _NONE, _NONE[0], looked_at, step)
         if known is not None:
             known(looked_at, some)
         self.see(looked_at, some)
@@ -448,7 +451,7 @@ class Products:
         least = self._large_terms.least_of_error(size[0], error, self._most_bytes)
         leasts = np.full(1, max(least, np.finfo(np.float32).tiny), np.float32)
         take_back()
-        tiles.multiply_one(values, size, leasts, out, has_few=np.zeros(1, np.bool_))
+        tiles.multiply_one(light, size, leasts, out, has_few=np.zeros(1, np.bool_))
         if known is not None:
             known(out, tile)
 

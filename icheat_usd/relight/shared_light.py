@@ -12,7 +12,7 @@ from icheat_usd.kernels.assemble import assemble_film, assemble_view, runs_in_or
 from icheat_usd.kernels.film_table import FilmTable
 from icheat_usd.relight.direct_sum import SummedLight
 from icheat_usd.relight.groups import SampleGroups, TermTable
-from icheat_usd.relight.narrow import Narrow
+from icheat_usd.relight.narrow import Narrow, Rest
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.versions import Versions
 from icheat_usd.samples import ViewSamples
@@ -110,19 +110,17 @@ class SharedLight:
         n_tiles = self._products.n_tiles
         self._sums[:, :n_tiles] = other._sums[:, :n_tiles]
 
-    def set_unedited(self, b: F32, seen: Callable[[], None] | None = None) -> None:
-        """Multiply the transport with the unedited light (n_gather, 3); `seen` as for `Products.multiply_all`."""
-        self._products.multiply_all(b, self._sums, seen=seen)
+    def set_unedited(self, light: F32, seen: Callable[[], None] | None = None) -> None:
+        """Multiply the transport with the unedited light; both as for `Products.multiply_all`."""
+        self._products.multiply_all(light, self._sums, seen=seen)
 
     def refine_unedited(self, b: F32, exact: Products, first: int) -> int:
         """Multiply some tiles of exact rows with the unedited light, from `first` on; the first tile that is left."""
         return exact.multiply_more(b, first, self._sums)
 
-    def set_unedited_near_rest(
-        self, narrow: Narrow, radiance: F32, gains: F32, seen: Callable[[], None] | None = None
-    ) -> None:
-        """The same of lights (n_lights, n_gather, 3) under gains, of which some may be as they were at rest."""
-        narrow.unedited(radiance, gains, self._sums, seen)
+    def set_unedited_near_rest(self, narrow: Narrow, rest: Rest, seen: Callable[[], None] | None = None) -> None:
+        """The same of lights of which some may be as they were at rest; see `Narrow.rest_of`."""
+        narrow.unedited(rest, self._sums, seen)
 
     def unedited(self, out: F32) -> None:
         """Unedited indirect light of all view samples into `out`."""
