@@ -217,6 +217,7 @@ class LargeTerms:
         size : (n_leaves,) float32
             Largest size of each Haar coefficient of the light.
         """
+        # No error is small enough: bytes alone decide.
         return self.least_of_error(size, -1.0, max_bytes)
 
     def least_of_error(self, size: F32, squared_error: float, max_bytes: int, share: float = 1.0) -> float:
