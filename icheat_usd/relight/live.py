@@ -591,8 +591,8 @@ class LiveRelighter:
             if self._narrow is not None:
                 self._narrow.forget(getattr(self.lights, "light_moves", None))
             self._films.forget()
-            if self._rest_weights is not None and self._rest_weights.forget():
-                self._take_weights()
+            if self._rest_weights is not None:
+                self._rest_weights.forget()
         self._moves_seen = moved
 
     def _light_paths(self) -> tuple[str, ...]:

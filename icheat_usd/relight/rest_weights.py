@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,12 +31,14 @@ _OTHER_RAYS = 0x5EE4
 
 
 class RestWeights:
-    """Fits weights in steps, and gives back those that there were before when lights change.
+    """Fits weights in steps; when lights move, these stay until they come to rest again.
 
     Interpolation is chosen for lights of any kind. Where geometry is a pixel wide it can be off by half of what one
     light brings to a sample, of which the light itself tells: its records differ much in it. Such samples are looked
     at with rays of their own under the lights at hand, and their weights are moved by least squares to what is seen,
     as far as that is no noise. Edits, groups and images of lights then come of these weights as they do of others.
+    A light that is dragged is mostly like it was, and a light that is not finds these weights as good as those that
+    there were before; what lights at rest show does not depend on them.
 
     Parameters
     ----------
@@ -56,20 +59,15 @@ class RestWeights:
     ) -> None:
         assert transport.interpolation is not None
         self._view, self._spread = view, transport.interpolation
-        self._given = self._spread.weights.copy()
+        self._before = replace(self._spread, weights=self._spread.weights.copy())
         self._lobes = [(lobe.name, lobe.tint) for lobe in transport.lobes if lobe.name in names]
         self._builders = [RowBuilder(snapshot, tracer, gather, transport.seed + _OTHER_RAYS + half) for half in (0, 1)]
         self._work: Iterator[None] | None = None
         self._is_done = False
-        self._is_fitted = False
 
-    def forget(self) -> bool:
-        """Take the weights that there were before, for other lights; whether that changes any."""
-        changed = self._is_fitted
-        if changed:
-            self._spread.weights[:] = self._given
-        self._work, self._is_done, self._is_fitted = None, False, False
-        return changed
+    def forget(self) -> None:
+        """Fit weights anew, to other lights."""
+        self._work, self._is_done = None, False
 
     @property
     def is_done(self) -> bool:
@@ -112,6 +110,7 @@ class RestWeights:
                 np.maximum(differs, differs_here / np.float32(square), out=differs)
         samples = _most_different(differs)
         if not len(samples):
+            self._spread.weights[:] = self._before.weights
             return
         columns = np.concatenate(shining, axis=1)
         seen = np.empty((2, len(samples), columns.shape[1]), np.float32)
@@ -124,7 +123,7 @@ class RestWeights:
 
     def _add_differences(self, tint: F32, at_rows: F32, image: F32, differs: F32) -> None:
         """Add what a lobe shows of a light, and the variance of its records at each sample, mean of the channels."""
-        mean, square = self._spread.matmul(at_rows), self._spread.matmul(np.square(at_rows))
+        mean, square = self._before.matmul(at_rows), self._before.matmul(np.square(at_rows))
         image += tint * mean
         differs += np.mean(np.square(tint) * np.maximum(square - np.square(mean), 0), axis=1)
 
@@ -139,7 +138,7 @@ class RestWeights:
         return out
 
     def _put(self, samples: I64, at_rows: F32, seen: F32) -> None:
-        """Change the weights of samples, ascending, towards what two estimates (2, n, k) say.
+        """Take the weights that there were before, those of samples, ascending, towards what two estimates (2, n, k) say.
 
         Parameters
         ----------
@@ -150,15 +149,15 @@ class RestWeights:
         entry = begin[:, None] + np.arange(count.max())
         is_there = entry < (begin + count)[:, None]
         entry = np.where(is_there, entry, begin[:, None])
-        given = np.where(is_there, self._given[entry], 0).astype(np.float64)
+        given = np.where(is_there, self._before.weights[entry], 0).astype(np.float64)
         shown = np.zeros((*entry.shape, seen.shape[2]))
         for (_, tint), values in zip(self._lobes, at_rows, strict=True):
             tints = np.tile(tint[samples], seen.shape[2] // 3)
             shown += tints[:, None] * values[self._spread.indices[entry]]
         shown *= is_there[:, :, None]
         fitted = fitted_weights(given, shown, seen[0], seen[1])
+        self._spread.weights[:] = self._before.weights
         self._spread.weights[entry[is_there]] = fitted[is_there]
-        self._is_fitted = True
 
 
 def fitted_weights(given: F64, shown: F64, one: F32, other: F32) -> F64:

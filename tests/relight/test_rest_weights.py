@@ -181,15 +181,59 @@ def test_an_identity_has_the_bits_of_the_unedited_image():
     np.testing.assert_array_equal(refined(one), refined(other))
 
 
-def test_moved_lights_have_the_weights_that_there_were():
+def weights_of(shown: LiveRelighter) -> F32:
+    spread = shown.transport.interpolation
+    assert spread is not None
+    return spread.weights.copy()
+
+
+def test_weights_stay_while_lights_move_and_until_others_fit():
+    shown = relighter(fits=True)
+    refined(shown)
+    weights, seen = weights_of(shown), []
+    assert len(fitted_samples(shown))
+    for _ in range(3):
+        move_a_light(shown)
+        shown.frame()
+        np.testing.assert_array_equal(weights_of(shown), weights)
+    move_a_light(shown)
+    while shown.refine():
+        seen.append(weights_of(shown))
+    changes = [not np.array_equal(one, other) for one, other in zip([weights, *seen], seen, strict=False)]
+    assert sum(changes) == 1 and changes.index(True) > 5
+    # As if there had been no lights before.
+    expected = relighter(fits=True)
+    for _ in range(4):
+        move_a_light(expected)
+    np.testing.assert_array_equal(refined(expected), shown.frame())
+    np.testing.assert_array_equal(weights_of(expected), seen[-1])
+
+
+def test_a_light_that_moves_a_little_is_nearer_to_what_rays_of_its_own_say():
     before, shown = relighter(fits=False), relighter(fits=True)
     refined(before)
     refined(shown)
-    assert len(fitted_samples(shown))
+    samples = fitted_samples(shown)
     for one in (before, shown):
-        move_a_light(one)
-    np.testing.assert_array_equal(before.frame(), shown.frame())
+        moved = 0.9 * one.lights.radiance + 0.1 * one.lights.radiance[:, ::-1]
+        one.lights.radiance, one.lights.moves, one.lights.revision = moved, 1, 1
+    expected = converged().to_view(shown.lights.radiance.sum(axis=0))
+    off = errors(before.relit().indirect, expected, samples)
+    assert errors(shown.relit().indirect, expected, samples) < 0.5 * off
+    np.testing.assert_array_equal(fitted_samples(shown), samples)
+
+
+def test_lights_that_need_no_fit_have_the_weights_that_there_were(monkeypatch):
+    shown = relighter(fits=True)
+    refined(shown)
+    assert len(fitted_samples(shown))
+    monkeypatch.setattr(rest_weights, "LEAST_DIFFERENCE", 1e3)
+    move_a_light(shown)
+    found = refined(shown)
     assert not len(fitted_samples(shown))
+    again = relighter(fits=True)
+    move_a_light(again)
+    np.testing.assert_array_equal(found, refined(again))
 
 
 def test_the_same_lights_have_the_same_weights_whatever_came_before():

@@ -17,7 +17,7 @@ from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import take_points
 from icheat_usd.relight import Relighter
 from icheat_usd.scene import F32, F64
-from icheat_usd.transport import CellLight, Transport, build_bounces, light_cells
+from icheat_usd.transport import CellLight, SparseRows, Transport, build_bounces, light_cells
 from icheat_usd.transport.packed import PackedTransport
 from tools.benchmarking.converged import (
     Probe,
@@ -81,6 +81,7 @@ class Dragged:
     shown: list[F32]  #: (n_view, 3) each
     radiance: F32  #: (n_lights, n_gather, 3)
     rest: F32  #: the same, less what is like it was at rest, whose product is known exactly
+    spread: SparseRows | None  #: interpolation with the weights that were fitted at rest, which stay
 
 
 def measure_errors(
@@ -157,10 +158,10 @@ def drag_lights(parts: Parts, drags: Sequence[Sequence[F64]]) -> Dragged:
             other.lights.change(light, to_world=to_world)
             other.live.frame()
         shown.append(other.shown(light, at_rest=False))
-    now = other.lights.radiance
+    now, spread = other.lights.radiance, other.live.transport.interpolation
     # As `relight.narrow` has it: of each channel as much as comes nearest.
     factor = (now * known).sum(axis=1) / np.maximum(np.square(known).sum(axis=1), 1e-30)
-    return Dragged(shown, now, (now - factor[:, None] * known).astype(np.float32))
+    return Dragged(shown, now, (now - factor[:, None] * known).astype(np.float32), spread)
 
 
 def _of_light(parts: Parts, references: References, light: int, at_once: F32, dragged: F32) -> dict[str, Any]:
@@ -219,23 +220,27 @@ def _lossy(
     again = lossy_errors(*scene, parts.packed, probe.samples[noisy], settings.noisy_rays, seeds, every)
     for off, better in zip(losses, again, strict=True):
         off[:, :, noisy] = better
-    # At rest nothing is packed, and some samples have other weights.
+    # Some samples have other weights at rest, which stay while lights are dragged; at rest nothing is packed.
     while parts.live.refine():
         pass
-    at_rest = parts.live.transport.interpolation
-    assert at_rest is not None
-    changed = np.flatnonzero(changed_rows(parts.transport.interpolation, at_rest)[probe.samples])
-    fitted = replace(parts.packed, source=replace(parts.transport, interpolation=at_rest))
-    resting = losses[0][:, :n].copy()
-    seeds = settings.seed + 7000, settings.seed + 8000
-    better, _ = lossy_errors(*scene, fitted, probe.samples[changed], settings.noisy_rays, seeds, own)
-    resting[:, :, changed] = better
+
+    def fitted(spread: SparseRows | None, seed: int) -> tuple[F32, F32]:
+        assert spread is not None and parts.transport.interpolation is not None
+        changed = np.flatnonzero(changed_rows(parts.transport.interpolation, spread)[probe.samples])
+        packed = replace(parts.packed, source=replace(parts.transport, interpolation=spread))
+        seeds = settings.seed + seed, settings.seed + seed + 1000
+        better = lossy_errors(*scene, packed, probe.samples[changed], settings.noisy_rays, seeds, every)
+        interpolation, both = losses[0].copy(), losses[1].copy()
+        interpolation[:, :, changed], both[:, :, changed] = better
+        return interpolation, both
+
+    resting, (moving, moving_packed) = fitted(parts.live.transport.interpolation, 7000)[0], fitted(dragged.spread, 9000)
     for light, name in enumerate(names):
         a, b = references.same_b[0][light][kept], references.same_b[1][light][kept]
         found = {}
         kinds = {"interpolation": losses[0], "interpolation_and_packing": losses[1], "lossy_at_rest": resting}
         # What packing loses is linear in the light; that of what is known from rest is not lost.
-        kinds["lossy_dragged"] = losses[0][:, n : 2 * n] + (losses[1] - losses[0])[:, 2 * n :]
+        kinds["lossy_dragged"] = moving[:, n : 2 * n] + (moving_packed - moving)[:, 2 * n :]
         for kind, off in kinds.items():
             one, two = (probe.to_pixels(half) for half in off[:, light])
             found[kind] = relative_error_of_halves(a + one, b + two, a, b).as_dict()
