@@ -138,7 +138,7 @@ class RestWeights:
         return out
 
     def _put(self, samples: I64, at_rows: F32, seen: F32) -> None:
-        """Take the weights that there were before, those of samples, ascending, towards what two estimates (2, n, k) say.
+        """Take the weights that there were before, some samples' (ascending) towards what two estimates (2, n, k) say.
 
         Parameters
         ----------
