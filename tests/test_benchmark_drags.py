@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,14 +48,17 @@ def test_a_drag_ends_where_the_light_stands_and_is_as_long_everywhere(parts: Par
 def test_what_is_known_from_rest_is_exact_and_only_the_rest_is_multiplied(parts: Parts) -> None:
     lights = choose_lights(parts.snapshot, parts.tracer, parts.view, 5)
     dragged = drag_lights(parts, [drag_to(light, parts.tracer) for light in lights])
-    exact = parts.transport
+    # With the weights that were fitted at rest.
+    exact, packed = (replace(rows, interpolation=dragged.spread) for rows in (parts.transport, parts.packed))
+    assert parts.transport.interpolation is not None and dragged.spread is not None
+    assert (dragged.spread.weights != parts.transport.interpolation.weights).any()
     for light in range(len(lights)):
         of_rest = dragged.rest[light]
         known = dragged.radiance[light] - of_rest
         # Each channel as near to what it was as a factor brings it.
         common = np.einsum("ic,ic->c", known.astype(np.float64), of_rest)
         assert (np.abs(common) < 1e-4 * np.square(known).sum(axis=0)).all() and known.any()
-        shown = exact.to_view(known) + parts.packed.to_view(of_rest)
+        shown = exact.to_view(known) + packed.to_view(of_rest)
         scale = np.sqrt(np.square(shown).mean())
         np.testing.assert_allclose(dragged.shown[light], np.maximum(shown, 0), rtol=0, atol=0.01 * scale)
-        assert np.abs(parts.packed.to_view(dragged.radiance[light]) - shown).max() > 0.01 * scale
+        assert np.abs(packed.to_view(dragged.radiance[light]) - shown).max() > 0.01 * scale
