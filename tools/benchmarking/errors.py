@@ -16,7 +16,7 @@ from icheat_usd.final_gather.gatherer import Gatherer, gathered_light
 from icheat_usd.lighting import build_light_sampler
 from icheat_usd.materials import take_points
 from icheat_usd.relight import Relighter
-from icheat_usd.scene import F32, F64
+from icheat_usd.scene import F32, F64, I64
 from icheat_usd.transport import CellLight, SparseRows, Transport, build_bounces, light_cells
 from icheat_usd.transport.packed import PackedTransport
 from tools.benchmarking.converged import (
@@ -210,31 +210,33 @@ def _lossy(
         return
     probe = references.probe.part(settings.record_pixels, settings.seed)
     kept = np.flatnonzero(np.isin(references.probe.pixel, probe.pixel))
-    own, seeds = parts.lights.radiance, (settings.seed + 3000, settings.seed + 4000)
+    own, given = parts.lights.radiance, parts.transport.interpolation
     scene = parts.snapshot, parts.tracer, parts.gather, parts.view
     n, every = len(own), np.concatenate([own, dragged.radiance, dragged.rest])
+    seeds = settings.seed + 3000, settings.seed + 4000
     losses = lossy_errors(*scene, parts.packed, probe.samples, settings.record_rays, seeds, every)
+
+    def again(packed: PackedTransport, some: I64, seed: int) -> tuple[F32, F32]:
+        """The losses, those of some samples by more rays of their own."""
+        seeds = settings.seed + seed, settings.seed + seed + 1000
+        better = lossy_errors(*scene, packed, probe.samples[some], settings.noisy_rays, seeds, every)
+        interpolation, both = losses[0].copy(), losses[1].copy()
+        interpolation[:, :, some], both[:, :, some] = better
+        return interpolation, both
+
+    def with_weights(spread: SparseRows | None, seed: int) -> tuple[F32, F32]:
+        assert spread is not None
+        packed = replace(parts.packed, source=replace(parts.transport, interpolation=spread))
+        return again(packed, np.flatnonzero(changed_rows(given, spread)[probe.samples]), seed)
+
     # Of rays that did not choose the pixels: what is measured stays without bias.
     noisy = samples_of_noisy_pixels(probe, (losses[0][:, :n], losses[1][:, :n]), settings.noisy_pixels)
-    seeds = settings.seed + 5000, settings.seed + 6000
-    again = lossy_errors(*scene, parts.packed, probe.samples[noisy], settings.noisy_rays, seeds, every)
-    for off, better in zip(losses, again, strict=True):
-        off[:, :, noisy] = better
+    losses = again(parts.packed, noisy, 5000)
     # Some samples have other weights at rest, which stay while lights are dragged; at rest nothing is packed.
     while parts.live.refine():
         pass
-
-    def fitted(spread: SparseRows | None, seed: int) -> tuple[F32, F32]:
-        assert spread is not None and parts.transport.interpolation is not None
-        changed = np.flatnonzero(changed_rows(parts.transport.interpolation, spread)[probe.samples])
-        packed = replace(parts.packed, source=replace(parts.transport, interpolation=spread))
-        seeds = settings.seed + seed, settings.seed + seed + 1000
-        better = lossy_errors(*scene, packed, probe.samples[changed], settings.noisy_rays, seeds, every)
-        interpolation, both = losses[0].copy(), losses[1].copy()
-        interpolation[:, :, changed], both[:, :, changed] = better
-        return interpolation, both
-
-    resting, (moving, moving_packed) = fitted(parts.live.transport.interpolation, 7000)[0], fitted(dragged.spread, 9000)
+    resting, _ = with_weights(parts.live.transport.interpolation, 7000)
+    moving, moving_packed = with_weights(dragged.spread, 9000)
     for light, name in enumerate(names):
         a, b = references.same_b[0][light][kept], references.same_b[1][light][kept]
         found = {}
