@@ -42,6 +42,37 @@ def noise_of_runs(direct: np.ndarray, area: np.ndarray, begin: np.ndarray, end: 
 
 
 @parallel_kernel
+def add_changes_of_runs(
+    direct: np.ndarray, before: np.ndarray, area: np.ndarray, begin: np.ndarray, end: np.ndarray, out: np.ndarray
+) -> None:
+    """Add the squared differences of the light of runs of cells from what it was.
+
+    Parameters
+    ----------
+    direct, before : (n_cells, 3), area : (n_cells,)
+    begin, end : (n_runs,) int64
+        As `noise_of_runs` has them.
+    out : (n_runs,) float64
+        Sums of ``(area * (level - level before)) ** 2`` are added.
+    """
+    for run in prange(len(begin)):
+        change = 0.0
+        for cell in range(begin[run], end[run]):
+            change += (area[cell] * (_level(direct, cell) - _level(before, cell))) ** 2
+        out[run] += change
+
+
+@parallel_kernel
+def copy_runs(runs: np.ndarray, begin: np.ndarray, end: np.ndarray, source: np.ndarray, out: np.ndarray) -> None:
+    """Copy the light (n_cells, 3) of some runs of cells."""
+    for i in prange(len(runs)):
+        for cell in range(begin[runs[i]], end[runs[i]]):
+            # A cell that two runs share gets the same from both.
+            for channel in range(3):
+                out[cell, channel] = source[cell, channel]
+
+
+@parallel_kernel
 def take_closer_looks(
     runs: np.ndarray, begin: np.ndarray, end: np.ndarray, cell_begin: np.ndarray, per_run: int, looked_at: np.ndarray,
     of_patches: np.ndarray, direct: np.ndarray,

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from icheat_usd.kernels.closer_look import noise_of_runs, take_closer_looks
+from icheat_usd.kernels.closer_look import add_changes_of_runs, copy_runs, noise_of_runs, take_closer_looks
 from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.kernels.workers import take_back
 from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, direct_at
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot
 
-#: Runs of patch points that are looked at in a frame, and with them their neighbours: some 40,000 points. Suns cost
-#: less, and borders of their patches need more.
-MOST_RUNS, MOST_RUNS_OF_SUN = 384, 512
+#: Runs of patch points that are looked at in a frame, and with them the run before and the one behind: some 40,000
+#: points.
+MOST_RUNS = 384
+#: All runs that are looked at of suns, which cost less, while borders of their patches need more.
+MOST_RUNS_OF_SUN = 1536
+#: Of suns, noise of so many runs next to each counts for it, so much of their mean.
+N_BESIDE, BESIDE = 7, 0.1
 #: Of these, the noisiest, such as those next to a small light, are looked at so many times.
 WORST_RUNS, TURNS = 16, 4
 #: Noise of all cells, beside all light of theirs, below which no run is worth a look; and what looks may leave of more.
@@ -22,12 +27,18 @@ LITTLE_NOISE, LEFT_NOISE, LEFT_NOISE_OF_SUN = 2e-3, 5e-4, 2e-4
 
 
 class CloserLook:
-    """Looks at all patch points of runs of cells, of those between which the light differs most."""
+    """Looks at all patch points of runs of cells, of those between which the light differs most.
 
-    def __init__(self, patches: Places, gather: GatherSamples) -> None:
+    Parameters
+    ----------
+    beside : (n_runs, N_BESIDE) int64
+        Of these places, `runs_beside`.
+    """
+
+    def __init__(self, patches: Places, gather: GatherSamples, beside: I64) -> None:
         first = np.arange(0, patches.n, RUN)
         last = np.minimum(first + RUN, patches.n) - 1
-        self._patches, self._gather = patches, gather
+        self._patches, self._gather, self._beside = patches, gather, beside
         self._begin, self._end = (  # cells of each run
             np.searchsorted(gather.cell_begin, first, side="right").astype(np.int64) - 1,
             np.searchsorted(gather.cell_begin, last, side="right").astype(np.int64),
@@ -35,6 +46,11 @@ class CloserLook:
         self._last = LastLook(patches)
         self._looked_at = np.zeros(len(first), np.uint8)
         self._found: F32 = np.empty((patches.n, 3), np.float32)
+        self._known: F32 | None = None  # of all cells, from when each was looked at closely for the last time
+
+    def know(self, direct: F32) -> None:
+        """Light of all cells (n_cells, 3) is known to be this, from many rays: what has changed is worth a look."""
+        self._known = direct.copy()
 
     def improve(
         self,
@@ -56,7 +72,7 @@ class CloserLook:
         told
             As `direct_at` has it.
         """
-        light, runs = self._noisy_runs(direct, shining.distant)
+        light, runs = (self._border_runs if shining.distant else self._noisy_runs)(direct)
         before, self._looked_at = self._looked_at, np.zeros_like(self._looked_at)
         self._looked_at[runs] = 1
         # What was not looked at in the frame before may be far from what it was.
@@ -79,6 +95,8 @@ class CloserLook:
                 total += more[places]
             self._found[places] = total / np.float32(TURNS)
             self._take(worst, direct)
+        if shining.distant and self._known is not None:
+            copy_runs(runs, self._begin, self._end, direct, self._known)
 
     def _noise(self, direct: F32, runs: I32 | slice = slice(None)) -> tuple[F64, float]:
         """Squared noise of each of some runs, and their light."""
@@ -87,20 +105,27 @@ class CloserLook:
         noise_of_runs(direct, self._gather.area, begin, end, found)
         return found[0], float(found[1].sum())
 
-    def _noisy_runs(self, direct: F32, distant: bool) -> tuple[float, I32]:
+    def _noisy_runs(self, direct: F32) -> tuple[float, I32]:
         """Light of all cells, and runs that are worth a look, ascending."""
-        most_runs, left_noise = (MOST_RUNS_OF_SUN, LEFT_NOISE_OF_SUN) if distant else (MOST_RUNS, LEFT_NOISE)
         noise, light = self._noise(direct)
-        if noise.sum() <= (LITTLE_NOISE * light) ** 2:
-            return light, np.empty(0, np.int32)
-        most = _largest(noise, most_runs)
-        left = noise.sum() - np.cumsum(noise[most])
-        most = most[: 1 + np.searchsorted(-left, -((left_noise * light) ** 2))]
-        # Beside what is seen to differ lies what one look has missed, such as the border of a patch of sun.
+        most = _worth_a_look(noise, MOST_RUNS, light, LEFT_NOISE)
+        # Beside what is seen to differ lies what one look has missed, such as the border of a shadow.
         wanted = np.zeros(len(noise) + 2, np.bool_)
         for beside in range(3):
             wanted[most + beside] = True
         return light, np.flatnonzero(wanted[1:-1]).astype(np.int32)
+
+    def _border_runs(self, direct: F32) -> tuple[float, I32]:
+        """The same of a sun: where its patch may end, though a look may have seen no light there.
+
+        That is where light was when it was looked at closely, and next to what differs. It is not in the order of the
+        cells: a patch has borders on all sides.
+        """
+        noise, light = self._noise(direct)
+        if self._known is not None:
+            add_changes_of_runs(direct, self._known, self._gather.area, self._begin, self._end, noise)
+        noise += BESIDE * noise[self._beside].mean(axis=1)
+        return light, np.sort(_worth_a_look(noise, MOST_RUNS_OF_SUN, light, LEFT_NOISE_OF_SUN)).astype(np.int32)
 
     def _worst_runs(self, direct: F32, light: float, runs: I32) -> I32:
         """Those of some runs that are still noisy, ascending; none if that does not matter."""
@@ -111,6 +136,27 @@ class CloserLook:
     def _take(self, runs: I32, direct: F32) -> None:
         cells = self._begin, self._end, self._gather.cell_begin
         take_closer_looks(runs, *cells, RUN, self._looked_at, self._found, direct)
+
+
+def runs_beside(places: F32) -> I64:
+    """Of each run of places (n, 3), in their order, the `N_BESIDE` next to it: (n_runs, N_BESIDE).
+
+    Where there are fewer, the run itself is among them.
+    """
+    first = np.arange(0, len(places), RUN)
+    size = np.diff(np.append(first, len(places)))
+    centre = np.add.reduceat(places.astype(np.float64), first, axis=0) / size[:, None]
+    found = cKDTree(centre).query(centre, k=N_BESIDE + 1)[1][:, 1:]
+    return np.where(found < len(first), found, np.arange(len(first))[:, None]).astype(np.int64)
+
+
+def _worth_a_look(noise: F64, n: int, light: float, left_noise: float) -> I64:
+    """At most `n` runs that are the noisiest, so that what others have does not matter beside the light of all."""
+    if noise.sum() <= (LITTLE_NOISE * light) ** 2:
+        return np.empty(0, np.int64)
+    most = _largest(noise, n)
+    left = noise.sum() - np.cumsum(noise[most])
+    return most[: 1 + np.searchsorted(-left, -((left_noise * light) ** 2))]
 
 
 def _largest(values: F64, n: int) -> I64:

@@ -36,7 +36,7 @@ from icheat_usd.lighting.quick import (
 )
 from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
-from icheat_usd.relight.closer_look import CloserLook
+from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside
 from icheat_usd.relight.grain import Grain, order_of_tiles
 from icheat_usd.relight.known_noise import KnownNoise
 from icheat_usd.relight.view_light import ROUNDS, ROUNDS_AT_GRAIN, look_in_rounds
@@ -96,6 +96,7 @@ class Surroundings:
     shadows: Shadows | None  #: None: the tracer can't be called from compiled loops
     cells: Places | None  #: one patch point of each cell
     patches: Places | None
+    beside: I64  #: runs of patches next to each, `closer_look.runs_beside`
     tiles: Places | None  #: view samples in the order of tiles of 8 x 8 pixels
     smooth: I64  #: view samples with narrow lobes
 
@@ -215,9 +216,11 @@ def build_surroundings(
     """Prepare the places where lights shine."""
     albedo = effective_albedo(gather.patch_points)
     shadows = cells = patches = tiles = None
+    beside = np.empty((0, N_BESIDE), np.int64)
     if isinstance(tracer, EmbreeTracer):
         shadows = build_shadows(snapshot, tracer)
         patches = prepare_places(snapshot, gather.patch_points, albedo, None)
+        beside = runs_beside(gather.patch_points.position)
         count = np.diff(gather.cell_begin)
         chosen = np.random.default_rng(seed).integers(0, count) + gather.cell_begin[:-1]
         cells = prepare_places(snapshot, take_points(gather.patch_points, chosen), albedo[chosen], None)
@@ -234,6 +237,7 @@ def build_surroundings(
         shadows,
         cells,
         patches,
+        beside,
         tiles,
         np.flatnonzero(is_glossy(view.points) & (view.points.roughness < _SMOOTH)),
         seed,
@@ -296,7 +300,7 @@ class Following:
         self._noise: tuple[KnownNoise, KnownNoise] | None = None  # of first looks at cells and at view samples
         self.cells = None if around.cells is None else LastLook(around.cells)
         self.view = None if around.tiles is None else LastLook(around.tiles)
-        self.patches = None if around.patches is None else CloserLook(around.patches, around.gather)
+        self.patches = None if around.patches is None else CloserLook(around.patches, around.gather, around.beside)
 
     def next_part(self) -> tuple[int, int]:
         """Of the cells, whose bounces are looked at this time; all of them at first."""
@@ -311,6 +315,8 @@ class Following:
             KnownNoise(every, look[0], known[0], least=_LEAST_AT_CELLS, smooths=False),
             KnownNoise(around.tiles.row, look[1], known[1], least=_LEAST_AT_VIEW, smooths=True),
         )
+        if self.patches is not None:
+            self.patches.know(known[0])
 
     def clean_cells(self, direct: F32) -> None:
         """Take known noise from a first look at the cells."""

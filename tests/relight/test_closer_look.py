@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icheat_usd.kernels.closer_look import noise_of_runs, take_closer_looks
+from icheat_usd.kernels.closer_look import add_changes_of_runs, copy_runs, noise_of_runs, take_closer_looks
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.relight import closer_look
-from icheat_usd.relight.closer_look import CloserLook
+from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from tests.pipeline import Pipeline
@@ -74,19 +75,45 @@ def test_a_sun_that_turns_is_as_well_known_as_at_a_first_look() -> None:
     assert np.mean(moved) < 1.1 * np.mean(first)
 
 
+@pytest.mark.parametrize(("n_runs", "what"), [(24, "what was known at rest"), (96, "what lies beside in space")])
+def test_borders_of_a_sun_are_found_by(n_runs: int, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not all runs are looked at, so that it matters which."""
+    monkeypatch.setattr(closer_look, "MOST_RUNS_OF_SUN", n_runs)
+    turned = [Light(LightKind.DISTANT, (3, 3, 3), rotation((0, 1, 0), 35 - k)[:3], (0.01, 0.0)) for k in range(4)]
+    start, end = Pipeline(room(turned[0]), n_gather=2048), Pipeline(room(turned[-1]), n_gather=2048)
+    found: list[list[float]] = [[], []]
+    for seed in range(4):
+        known = first_look(end, seed)
+        while known.refine():
+            pass
+        for errors, has_it in zip(found, (False, True), strict=True):
+            with monkeypatch.context() as patch:
+                if not has_it and what == "what was known at rest":
+                    patch.setattr(CloserLook, "know", lambda *_: None)
+                elif not has_it:
+                    patch.setattr(closer_look, "BESIDE", 0.0)
+                lights = first_look(start, seed)
+                while lights.refine():
+                    pass
+                for light in turned[1:]:
+                    lights.change(0, to_world=light.to_world)
+            errors.append(error(lights._lights[0].direct, known._lights[0].direct, end.gather.area))
+    assert np.mean(found[1]) < 0.9 * np.mean(found[0]), found
+
+
 def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where cells beside each other get the same light, no ray is sent."""
     pipeline = Pipeline(room(SUN), n_gather=512)
     lights = first_look(pipeline, 0)
     assert lights._around.patches is not None
-    look = CloserLook(lights._around.patches, pipeline.gather)
+    look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
     even = np.ones((pipeline.gather.n, 3), np.float32)
-    assert len(look._noisy_runs(even, False)[1]) == 0
+    assert len(look._noisy_runs(even)[1]) == len(look._border_runs(even)[1]) == 0
     assert len(look._worst_runs(even, 1.0, np.arange(4, dtype=np.int32))) == 0
     monkeypatch.setattr(closer_look, "MOST_RUNS", 2)
     spotted = even.copy()
     spotted[::50] = 9.0
-    assert 2 < len(look._noisy_runs(spotted, False)[1]) <= 6
+    assert 2 < len(look._noisy_runs(spotted)[1]) <= 6
 
 
 def test_noise_of_runs_is_that_of_a_plain_loop() -> None:
@@ -100,6 +127,39 @@ def test_noise_of_runs_is_that_of_a_plain_loop() -> None:
         mean = (level * size).sum() / size.sum() if len(size) else 0.0
         np.testing.assert_allclose(found[0, run], ((size * (level - mean)) ** 2).sum(), rtol=1e-5)
         np.testing.assert_allclose(found[1, run], (size * level).sum(), rtol=1e-5)
+
+
+def test_changes_and_copies_of_runs_are_those_of_plain_loops() -> None:
+    rng = np.random.default_rng(3)
+    direct, before = rng.random((2, 50, 3)).astype(np.float32)
+    area = rng.random(50).astype(np.float32)
+    begin, end = np.array([0, 6, 20, 50]), np.array([7, 20, 50, 50])
+    found = np.ones(4)
+    add_changes_of_runs(direct, before, area, begin, end, found)
+    for run in range(4):
+        cells = slice(begin[run], end[run])
+        change = area[cells] * (direct[cells] - before[cells]).sum(axis=1, dtype=np.float64)
+        np.testing.assert_allclose(found[run], 1 + (change**2).sum(), rtol=1e-5)
+    out = before.copy()
+    copy_runs(np.array([0, 2], np.int32), begin, end, direct, out)
+    np.testing.assert_array_equal(out, np.concatenate([direct[:7], before[7:20], direct[20:]]))
+
+
+def test_runs_beside_one_are_the_nearest() -> None:
+    rng = np.random.default_rng(4)
+    places = rng.random((20 * RUN + 5, 3)).astype(np.float32)
+    found = runs_beside(places)
+    centre = np.array([places[first : first + RUN].mean(axis=0) for first in range(0, len(places), RUN)])
+    for run, near in enumerate(found):
+        distance = np.linalg.norm(centre - centre[run], axis=1)
+        distance[run] = np.inf
+        assert set(near) == set(np.argsort(distance)[:N_BESIDE])
+
+
+def test_where_there_are_few_runs_each_is_beside_itself() -> None:
+    np.testing.assert_array_equal(np.sort(runs_beside(np.eye(3, dtype=np.float32))), np.zeros((1, N_BESIDE)))
+    assert set(runs_beside(np.random.default_rng(5).random((2 * RUN, 3)).astype(np.float32)).ravel()) == {0, 1}
+    assert runs_beside(np.empty((0, 3), np.float32)).shape == (0, N_BESIDE)
 
 
 def test_cells_get_the_mean_of_what_was_looked_at() -> None:
