@@ -83,8 +83,10 @@ def _change_a_little() -> None:
             live.film()
             live.set_light(light, gain=0.4)
             live.frame()
-            # What is known of a light at rest when it moves on.
+            # What is known of lights at rest when they move on; of suns it is looked at in other ways.
             live.set_light(light, move=(0.02, 0.0, 0.0))
+            for sun in (path for path in live.lights if path.endswith("/Sun")):
+                live.set_light(sun, turn=((0.0, 1.0, 0.0), 1.0))
             live.frame()
 
 
