@@ -24,8 +24,10 @@ LEAST_DIFFERENCE, MOST_SHARE, MOST = 0.1, 0.01, 4096
 RAYS = 2048
 #: How strongly weights stay near the given ones, in units of the mean curvature.
 PRIOR = 0.05
-#: How much plausible lights count, all of them together, beside the lights at rest.
-TRAINING_SHARE = 1.0
+#: How much plausible lights count, all of them together, beside each of the lights at rest.
+TRAINING_SHARE = 2.0
+#: View samples that tell how bright an image they make.
+_LEVEL_SAMPLES = 4096
 #: Of coordinate descent: within a thousandth of the least squares.
 _SWEEPS = 60
 #: Samples that are looked at in one step: some tens of milliseconds.
@@ -128,8 +130,8 @@ class RestWeights:
         if not len(samples):
             self._spread.weights[:] = self._before.weights
             return
-        entries = _entries_of(self._before, samples)
-        records = np.unique(self._before.indices[entries.place[entries.is_there]]).astype(np.int64)
+        some = np.arange(0, self._view.n, max(1, self._view.n // _LEVEL_SAMPLES))
+        records = self._records_of(np.union1d(samples, some))
         # Three at a time are the channels of one light.
         training = np.ascontiguousarray(self._training[: len(self._training) // 3 * 3].T)
         of_training = np.empty((len(self._lobes), len(records), training.shape[1]), np.float32)
@@ -138,15 +140,20 @@ class RestWeights:
             for lobe, values in zip(self._lobes, of_training, strict=True):
                 values[part] = take_rows(lobe.rows, records[part]).matmul(training)
             yield
-        at_records = np.concatenate([*(values[:, records] for values in products), of_training], axis=2)
-        columns = np.concatenate([*shining, training], axis=1)
+        given, shown = self._shown(some, records, of_training)
+        square = np.mean(np.square(np.einsum("nm,nmk->nk", given, shown)), axis=0)
+        share = 3 * TRAINING_SHARE / max(1, len(square)) / np.where(square > 0, square, np.inf)
+        factor = np.sqrt(share).astype(np.float32)
+        yield
+        at_records = np.concatenate([*(values[:, records] for values in products), factor * of_training], axis=2)
+        columns = np.concatenate([*shining, factor * training], axis=1)
         seen = np.empty((2, len(samples), columns.shape[1]), np.float32)
         for first in range(0, len(samples), _TOGETHER):
             for half, builder in enumerate(self._builders):
                 part = slice(first, first + _TOGETHER)
                 seen[half, part] = self._look(builder, samples[part], columns)
                 yield
-        self._put(samples, entries, records, at_records, seen)
+        self._put(samples, records, at_records, seen)
 
     def _add_differences(self, tint: F32, at_rows: F32, image: F32, differs: F32) -> None:
         """Add what a lobe shows of a light, and the variance of its records at each sample, mean of the channels."""
@@ -164,29 +171,36 @@ class RestWeights:
                 out += _in_columns(lobe.tint[samples], light.shape[1]) * rows[lobe.name].matmul(light)
         return out
 
-    def _put(self, samples: I64, entries: _Entries, records: I64, at_records: F32, seen: F32) -> None:
-        """Take the weights that there were before, some samples' (ascending) towards what two estimates (2, n, k) say.
+    def _records_of(self, samples: I64) -> I64:
+        """Numbers of the records that some samples are made of, ascending."""
+        entries = _entries_of(self._before, samples)
+        return np.unique(self._before.indices[entries.place[entries.is_there]]).astype(np.int64)
+
+    def _shown(self, samples: I64, records: I64, at_records: F32) -> tuple[F64, F64]:
+        """Weights of the records of some samples (n, m), and what these would show with each alone: (n, m, k).
 
         Parameters
         ----------
-        records : (m,)
-            Ascending.
-        at_records : (n_lobes, m, k)
-            What shines on these of the lights at rest, and then of plausible ones.
+        records
+            Ascending; theirs are among them.
+        at_records : (n_lobes, n_records, k)
+            What shines on these.
         """
-        given = np.where(entries.is_there, self._before.weights[entries.place], 0).astype(np.float64)
+        entries = _entries_of(self._before, samples)
         record = np.searchsorted(records, self._before.indices[entries.place])
-        shown = np.zeros((*record.shape, seen.shape[2]))
+        shown = np.zeros((*record.shape, at_records.shape[2]))
         for lobe, values in zip(self._lobes, at_records, strict=True):
-            shown += _in_columns(lobe.tint[samples], seen.shape[2])[:, None] * values[record]
-        shown *= entries.is_there[:, :, None]
-        # Together plausible lights count as one of the lights does, times their share.
-        n = seen.shape[2] - len(self._training) // 3 * 3
-        size, of_training = (float(np.square(part).sum()) for part in (shown[:, :, :n], shown[:, :, n:]))
-        share = np.sqrt(TRAINING_SHARE * 3 / n * size / of_training) if of_training > 0 else 0.0
-        shown[:, :, n:] *= share
-        seen[:, :, n:] *= np.float32(share)
-        fitted = fitted_weights(given, shown, seen[0], seen[1])
+            shown += _in_columns(lobe.tint[samples], at_records.shape[2])[:, None] * values[record]
+        given = np.where(entries.is_there, self._before.weights[entries.place], 0).astype(np.float64)
+        return given, shown * entries.is_there[:, :, None]
+
+    def _put(self, samples: I64, records: I64, at_records: F32, seen: F32) -> None:
+        """Take the weights that there were before, some samples' (ascending) towards what two estimates (2, n, k) say.
+
+        `records` and `at_records` are those of `_shown`.
+        """
+        fitted = fitted_weights(*self._shown(samples, records, at_records), seen[0], seen[1])
+        entries = _entries_of(self._before, samples)
         self._spread.weights[:] = self._before.weights
         self._spread.weights[entries.place[entries.is_there]] = fitted[entries.is_there]
 

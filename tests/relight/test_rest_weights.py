@@ -138,13 +138,13 @@ def test_weights_are_fitted_to_what_each_record_shows(monkeypatch):
     samples, exact, radiance = fitted_samples(shown), sparse().transport, sparse().cell_light.radiance
     spread = exact.interpolation
     scale = [np.sqrt(np.mean(exact.to_view(light).astype(np.float64) ** 2)) for light in radiance]
-    # Beside the two lights there are plausible ones, which count as one of them does.
-    lights, others = at_records[:, :, :6], at_records[:, :, 6:]
-    np.testing.assert_allclose(np.square(others).sum(), TRAINING_SHARE / 2 * np.square(lights).sum())
-    assert len(weights) == len(samples) and (one != other).any()
+    # Beside the two lights there are plausible ones, each in units of its image, which have a share together.
+    others = plausible().reshape(8, 3, -1).swapaxes(1, 2)
+    squares = [np.square(exact.to_view(np.ascontiguousarray(light)), dtype=np.float64).mean(axis=0) for light in others]
+    others = others * np.sqrt(TRAINING_SHARE / 8 / np.array(squares))[:, None]
     n_records = np.diff(spread.indptr)[samples]
     assert n_records.min() < n_records.max()
-    shining = np.concatenate([radiance / np.array(scale)[:, None, None], plausible().reshape(8, 3, -1).swapaxes(1, 2)])
+    shining = np.concatenate([radiance / np.array(scale)[:, None, None], others]).astype(np.float32)
     expected = np.zeros(at_records.shape)
     for i, sample in enumerate(samples):
         here = slice(*spread.indptr[sample : sample + 2])
@@ -154,7 +154,6 @@ def test_weights_are_fitted_to_what_each_record_shows(monkeypatch):
             parts = [[lobe.tint[sample] * lobe.rows.rows(record, record + 1).matmul(light)[0] for light in shining]
                      for lobe in exact.lobes]  # fmt: skip
             expected[i, j] = np.sum(parts, axis=0).ravel()
-    expected[:, :, 6:] *= np.linalg.norm(others) / np.linalg.norm(expected[:, :, 6:])
     np.testing.assert_allclose(at_records, expected, rtol=1e-4, atol=1e-6)
 
 
