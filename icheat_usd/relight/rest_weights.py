@@ -25,7 +25,7 @@ RAYS = 2048
 #: How strongly weights stay near the given ones, in units of the mean curvature.
 PRIOR = 0.05
 #: How much plausible lights count, all of them together, beside each of the lights at rest.
-TRAINING_SHARE = 2.0
+TRAINING_SHARE = 1.0
 #: View samples that tell how bright an image they make.
 _LEVEL_SAMPLES = 4096
 #: Of coordinate descent: within a thousandth of the least squares.
