@@ -12,9 +12,9 @@ from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, direct
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot
 
-#: Runs of patch points that are looked at in a frame, and with them the run before and the one behind: some 40,000
+#: Runs of patch points that are looked at in a frame, and with them the run before and the one behind: some 30,000
 #: points.
-MOST_RUNS = 384
+MOST_RUNS = 256
 #: All runs that are looked at of suns, which cost less, while borders of their patches need more.
 MOST_RUNS_OF_SUN = 1536
 #: Of suns, noise of so many runs next to each counts for it, so much of their mean.

@@ -162,7 +162,7 @@ def test_weights_suit_plausible_lights_too(monkeypatch):
     others = np.ascontiguousarray(plausible().reshape(8, 3, -1).swapaxes(1, 2))
     exact = [converged().to_view(light) for light in others]
     off = []
-    for share in (0.0, TRAINING_SHARE):
+    for share in (0.0, TRAINING_SHARE, 10.0):
         monkeypatch.setattr(rest_weights, "TRAINING_SHARE", share)
         shown = relighter(fits=True)
         refined(shown)
@@ -170,7 +170,8 @@ def test_weights_suit_plausible_lights_too(monkeypatch):
         assert isinstance(rows, Transport)
         pairs = zip([rows.to_view(light) for light in others], exact, strict=True)
         off.append(sum(errors(one, other, samples) / np.mean(np.square(other)) for one, other in pairs))
-    assert off[1] < 0.8 * off[0]
+    assert off[2] < off[1] < off[0]
+    assert off[2] < 0.8 * off[0]
 
 
 def test_lights_that_other_lights_do_not_reach_stay_at_0(monkeypatch):
