@@ -101,6 +101,25 @@ def test_borders_of_a_sun_are_found_by(n_runs: int, what: str, monkeypatch: pyte
     assert np.mean(found[1]) < 0.9 * np.mean(found[0]), found
 
 
+def test_where_a_sun_was_long_ago_is_not_looked_at_for_ever() -> None:
+    """What a closer look found there is known from then on."""
+    sun, far = (Light(LightKind.DISTANT, (3, 3, 3), rotation((0, 1, 0), k)[:3], (0.01, 0.0)) for k in (35, -35))
+    pipeline = Pipeline(room(sun), n_gather=2048)
+    lights = first_look(pipeline, 0)
+    while lights.refine():
+        pass
+    n_looked_at = []
+    for _ in range(3):
+        lights.change(0, to_world=far.to_world)
+        following = lights._lights[0].following
+        assert following is not None and following.patches is not None
+        n_looked_at.append(int(following.patches._looked_at.sum()))
+    fresh = first_look(Pipeline(room(far), n_gather=2048), 0)._lights[0].following
+    assert fresh is not None and fresh.patches is not None
+    assert n_looked_at[0] > 1.2 * n_looked_at[-1] > 0
+    assert n_looked_at[-1] <= 1.1 * fresh.patches._looked_at.sum()
+
+
 def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where cells beside each other get the same light, no ray is sent."""
     pipeline = Pipeline(room(SUN), n_gather=512)
