@@ -298,6 +298,7 @@ class Following:
     def __init__(self, around: Surroundings) -> None:
         self.n = 0  #: first looks so far
         self._noise: tuple[KnownNoise, KnownNoise] | None = None  # of first looks at cells and at view samples
+        self._known: SceneSnapshot | None = None  # the light of which this is known
         self.cells = None if around.cells is None else LastLook(around.cells)
         self.view = None if around.tiles is None else LastLook(around.tiles)
         self.patches = None if around.patches is None else CloserLook(around.patches, around.gather, around.beside)
@@ -307,9 +308,15 @@ class Following:
         self.n += 1
         return (0, 1) if self.n == 1 else (self.n % PARTS, PARTS)
 
-    def know(self, around: Surroundings, look: tuple[F32, F32], known: tuple[F32, F32]) -> None:
-        """Take from later first looks what is noise in one, at cells and at view samples, by what is known there."""
+    def know(
+        self, around: Surroundings, alone: SceneSnapshot, look: tuple[F32, F32], known: tuple[F32, F32]
+    ) -> None:
+        """Take from later first looks what is noise in one, at cells and at view samples, by what is known there.
+
+        `alone` is the light as it was then.
+        """
         assert around.tiles is not None
+        self._known = alone
         every = np.arange(around.gather.n, dtype=np.int32)
         self._noise = (
             KnownNoise(every, look[0], known[0], least=_LEAST_AT_CELLS, smooths=False),
@@ -323,10 +330,23 @@ class Following:
         if self._noise is not None:
             self._noise[0].take_from(direct)
 
-    def clean_view(self, view_direct: F32) -> None:
-        """The same for the view samples."""
-        if self._noise is not None:
+    def clean_view(self, view_direct: F32, alone: SceneSnapshot) -> None:
+        """The same for the view samples, of the light as it is now.
+
+        Not of a sun that has left its place in the sky: borders of its shadows are elsewhere, and noise that there was
+        would be shown as ghosts of them.
+        """
+        if self._noise is not None and self._known is not None and not _has_left(self._known, alone):
             self._noise[1].take_from(view_direct)
+
+
+def _has_left(before: SceneSnapshot, now: SceneSnapshot) -> bool:
+    """Whether a distant light of a one-light snapshot turned by more than its half-angle."""
+    if now.lights.kind[0] != LightKind.DISTANT:
+        return False
+    was, axis = (snapshot.lights.to_world[0, :, 2].astype(np.float64) for snapshot in (before, now))
+    turned = np.arctan2(np.linalg.norm(np.cross(was, axis)), was @ axis)
+    return bool(turned > now.lights.size[0, 0])
 
 
 class MovingLight:
@@ -375,7 +395,7 @@ class MovingLight:
         if known is not None and self.direct is not None:
             look = np.empty_like(self.direct), np.empty_like(view_direct)
             MovingLight(around, known, self._seed, self._rounds, None)._look(last, *look)
-            last.know(around, look, (self.direct, view_direct))
+            last.know(around, known, look, (self.direct, view_direct))
         direct = np.empty((around.gather.n, 3), np.float32)
 
         def bounce() -> None:
@@ -383,7 +403,7 @@ class MovingLight:
             around.bounce(direct, radiance, self.direct, last.next_part())
 
         self._look(last, direct, view_direct, bounce)
-        last.clean_view(view_direct)
+        last.clean_view(view_direct, self._alone)
         self.direct = direct
 
     def _look(
@@ -396,7 +416,9 @@ class MovingLight:
         shadows = around.shadows_of(self._alone)
         told = look_and_tell(self._alone, shadows, around.cells, self._seed, direct, last.cells, self._shining)
         tiles, closer = around.tiles, last.patches
-        look = Look(self._alone, shadows, tiles, self._shining, self._seed, True, view_direct, 0, last.view, told)
+        # Borders of a sun's patch go by faster than a part of the rays finds them.
+        before = None if self._shining.distant else last.view
+        look = Look(self._alone, shadows, tiles, self._shining, self._seed, True, view_direct, 0, before, told)
 
         def work() -> None:
             closer.improve(self._alone, shadows, self._seed, self._shining, direct, told)
@@ -542,13 +564,13 @@ class AnyLight:
             if known is not None and self.direct is not None:
                 look = np.empty_like(self.direct), np.empty_like(view_direct)
                 self._look_at_sky(known, *look)
-                last.know(around, look, (self.direct, view_direct))
+                last.know(around, known, look, (self.direct, view_direct))
             direct = np.empty((around.gather.n, 3), np.float32)
             self._look_at_sky(self._alone, direct, view_direct)
             last.clean_cells(direct)
             around.bounce(direct, radiance, self.direct, last.next_part())
             self.direct = direct
-            last.clean_view(view_direct)
+            last.clean_view(view_direct, self._alone)
             return
         patch = around.gather.cell_begin[:-1]
         points = take_points(around.gather.patch_points, patch)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from icheat_usd.relight.light_work import _has_left
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.session.frames import array_bytes
@@ -27,6 +28,12 @@ def rect(x: float) -> Light:
 def dome(angle: float) -> Light:
     to_world = rotation((0, 1, 0), angle)[:3].astype(np.float32)
     return Light(LightKind.DOME, (1, 1, 1), to_world, image=gradient_image(), path="/dome")
+
+
+def sun(degrees: float) -> Light:
+    """Half a degree wide to either side."""
+    to_world = rotation((0, 1, 0), 35.0 + degrees)[:3].astype(np.float32)
+    return Light(LightKind.DISTANT, (3, 3, 3), to_world, (float(np.radians(0.5)), 0.0), path="/sun")
 
 
 def room(light: Light) -> SceneSnapshot:
@@ -95,6 +102,28 @@ def test_far_from_there_it_is_no_worse_than_if_it_had_never_been_there(scene: Pi
     steps = [k * step for k in range(10, 61, 10)]
     known, unknown = (off(scene, dragged(scene, light, steps, rests), true) for rests in (True, False))
     assert (known < 1.05 * unknown).all()
+
+
+def test_a_sun_that_has_left_its_place_looks_as_if_it_had_never_been_there(scene: Pipeline):
+    """At the view: no ghosts of its shadows."""
+    steps = [3.0 * k for k in range(1, 7)]
+    known, unknown = (dragged(scene, sun, steps, rests) for rests in (True, False))
+    true = settle(build(scene, sun(18.0)))
+    assert off(scene, known, true)[0] < 1.02 * off(scene, unknown, true)[0]
+
+
+def test_a_sun_has_left_its_place_when_it_turned_by_its_half_angle():
+    place = room(sun(0.0))
+    assert [_has_left(place, room(sun(degrees))) for degrees in (0.0, 0.45, -0.45, 0.55, -0.55, 180.0)] == [
+        False, False, False, True, True, True,
+    ]  # fmt: skip
+    assert not _has_left(room(rect(0.0)), room(rect(1.0)))
+
+
+def test_a_sun_that_hardly_turned_is_known_where_it_rested(scene: Pipeline):
+    true = settle(build(scene, sun(0.1)))
+    known, unknown = (off(scene, dragged(scene, sun, [0.1], rests), true) for rests in (True, False))
+    assert known[0] < 0.8 * unknown[0]
 
 
 def test_some_rounds_are_enough_to_know_noise_and_fewer_are_not(scene: Pipeline):
