@@ -298,7 +298,6 @@ class Following:
     def __init__(self, around: Surroundings) -> None:
         self.n = 0  #: first looks so far
         self._noise: tuple[KnownNoise, KnownNoise] | None = None  # of first looks at cells and at view samples
-        self._known: SceneSnapshot | None = None  # the light of which this is known
         self.cells = None if around.cells is None else LastLook(around.cells)
         self.view = None if around.tiles is None else LastLook(around.tiles)
         self.patches = None if around.patches is None else CloserLook(around.patches, around.gather, around.beside)
@@ -316,11 +315,12 @@ class Following:
         `alone` is the light as it was then.
         """
         assert around.tiles is not None
-        self._known = alone
+        # Smoothed, a sun's patch would leave ghosts of its borders where these were.
+        smooths = int(alone.lights.kind[0]) != LightKind.DISTANT
         every = np.arange(around.gather.n, dtype=np.int32)
         self._noise = (
             KnownNoise(every, look[0], known[0], least=_LEAST_AT_CELLS, smooths=False),
-            KnownNoise(around.tiles.row, look[1], known[1], least=_LEAST_AT_VIEW, smooths=True),
+            KnownNoise(around.tiles.row, look[1], known[1], least=_LEAST_AT_VIEW, smooths=smooths),
         )
         if self.patches is not None:
             self.patches.know(known[0])
@@ -330,23 +330,10 @@ class Following:
         if self._noise is not None:
             self._noise[0].take_from(direct)
 
-    def clean_view(self, view_direct: F32, alone: SceneSnapshot) -> None:
-        """The same for the view samples, of the light as it is now.
-
-        Not of a sun that has left its place in the sky: borders of its shadows are elsewhere, and noise that there was
-        would be shown as ghosts of them.
-        """
-        if self._noise is not None and self._known is not None and not _has_left(self._known, alone):
+    def clean_view(self, view_direct: F32) -> None:
+        """The same for the view samples."""
+        if self._noise is not None:
             self._noise[1].take_from(view_direct)
-
-
-def _has_left(before: SceneSnapshot, now: SceneSnapshot) -> bool:
-    """Whether a distant light of a one-light snapshot turned by more than its half-angle."""
-    if now.lights.kind[0] != LightKind.DISTANT:
-        return False
-    was, axis = (snapshot.lights.to_world[0, :, 2].astype(np.float64) for snapshot in (before, now))
-    turned = np.arctan2(np.linalg.norm(np.cross(was, axis)), was @ axis)
-    return bool(turned > now.lights.size[0, 0])
 
 
 class MovingLight:
@@ -403,7 +390,7 @@ class MovingLight:
             around.bounce(direct, radiance, self.direct, last.next_part())
 
         self._look(last, direct, view_direct, bounce)
-        last.clean_view(view_direct, self._alone)
+        last.clean_view(view_direct)
         self.direct = direct
 
     def _look(
@@ -570,7 +557,7 @@ class AnyLight:
             last.clean_cells(direct)
             around.bounce(direct, radiance, self.direct, last.next_part())
             self.direct = direct
-            last.clean_view(view_direct, self._alone)
+            last.clean_view(view_direct)
             return
         patch = around.gather.cell_begin[:-1]
         points = take_points(around.gather.patch_points, patch)
