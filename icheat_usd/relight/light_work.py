@@ -307,9 +307,7 @@ class Following:
         self.n += 1
         return (0, 1) if self.n == 1 else (self.n % PARTS, PARTS)
 
-    def know(
-        self, around: Surroundings, alone: SceneSnapshot, look: tuple[F32, F32], known: tuple[F32, F32]
-    ) -> None:
+    def know(self, around: Surroundings, alone: SceneSnapshot, look: tuple[F32, F32], known: tuple[F32, F32]) -> None:
         """Take from later first looks what is noise in one, at cells and at view samples, by what is known there.
 
         `alone` is the light as it was then.
