@@ -30,13 +30,12 @@ from icheat_usd.relight.narrow import Narrow
 from icheat_usd.relight.pair_products import PairProducts
 from icheat_usd.relight.products import Products
 from icheat_usd.relight.relighter import RelitView
-from icheat_usd.relight.rest_weights import RestWeights
+from icheat_usd.relight.rest_weights import FitSource, RestWeights
 from icheat_usd.relight.shared_light import OwnLight, SharedLight, seen_samples
 from icheat_usd.relight.term_tables import TermTables
 from icheat_usd.relight.versions import Versions
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I64, Bool, SceneSnapshot
-from icheat_usd.tracing import Tracer
 from icheat_usd.transport import HeldBack, Transport
 from icheat_usd.transport.packed import PackedTransport
 
@@ -76,7 +75,7 @@ class LiveRelighter:
         Needed by edits that let light pass occluders.
     moving_detail
         Of light not seen before, errors of terms that are not read are divided by this; frames take longer.
-    tracer : Tracer, optional
+    fit_source : FitSource, optional
         With it, weights of interpolation are fitted to lights at rest, see `relight.rest_weights`.
     """
 
@@ -90,9 +89,9 @@ class LiveRelighter:
         *,
         held_back: HeldBack | None = None,
         moving_detail: float = 1.0,
-        tracer: Tracer | None = None,
+        fit_source: FitSource | None = None,
     ) -> None:
-        self._tracer = tracer
+        self._fit_source = fit_source
         self._moving_detail = moving_detail
         self.view, self.gather, self.lights, self.held_back = view, gather, lights, held_back
         self._snapshot = snapshot
@@ -137,9 +136,9 @@ class LiveRelighter:
         if exact is not None and exact is not transport and self._products.names:
             self._exact_products = Products(exact, self.gather.tree, self._products.names)
             self._narrow = Narrow(self._products, self._exact_products)
-            if self._tracer is not None and exact.interpolation is not None:
-                scene = self._snapshot, self._tracer, self.view, self.gather
-                self._rest_weights = RestWeights(*scene, exact, self._products.names)
+            if self._fit_source is not None and exact.interpolation is not None:
+                scene = self._snapshot, self.view, self.gather
+                self._rest_weights = RestWeights(self._fit_source, *scene, exact, self._products.names)
         # Uncompressed means exact: what is interpolated is then the transport alone, not what edits make of it.
         self._stack.set_at_records(isinstance(transport, PackedTransport) or transport.interpolation is None)
         self._regroup()

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from icheat_usd.materials import take_points
 from icheat_usd.samples import GatherSamples, ViewSamples
-from icheat_usd.scene import F32, F64, I64, SceneSnapshot
+from icheat_usd.scene import F32, F64, I64, Bool, SceneSnapshot
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport import Transport
 from icheat_usd.transport.build import rows_of_points
 from icheat_usd.transport.rays import RowBuilder
+from icheat_usd.transport.sparse import SparseRows, take_rows
 
 #: Samples are fitted whose records differ by more than this of the image's root mean square, in any light; of these
 #: those that differ most, so many of all and no more than can be looked at in some seconds.
@@ -22,12 +24,25 @@ LEAST_DIFFERENCE, MOST_SHARE, MOST = 0.1, 0.01, 4096
 RAYS = 2048
 #: How strongly weights stay near the given ones, in units of the mean curvature.
 PRIOR = 0.05
+#: How much plausible lights count, all of them together, beside each of the lights at rest.
+TRAINING_SHARE = 1.0
+#: View samples that tell how bright an image they make.
+_LEVEL_SAMPLES = 4096
 #: Of coordinate descent: within a thousandth of the least squares.
 _SWEEPS = 60
 #: Samples that are looked at in one step: some tens of milliseconds.
 _TOGETHER = 24
+#: Records whose light of plausible lights is found in one step.
+_RECORDS_TOGETHER = 2048
 #: Of the seed of the rows: rays are others.
 _OTHER_RAYS = 0x5EE4
+
+
+class FitSource(NamedTuple):
+    """What weights are fitted with."""
+
+    tracer: Tracer
+    training: F32  #: (n, n_gather), `transport.training.training_radiance`
 
 
 class RestWeights:
@@ -37,8 +52,8 @@ class RestWeights:
     light brings to a sample, of which the light itself tells: its records differ much in it. Such samples are looked
     at with rays of their own under the lights at hand, and their weights are moved by least squares to what is seen,
     as far as that is no noise. Edits, groups and images of lights then come of these weights as they do of others.
-    A light that is dragged is mostly like it was, and a light that is not finds these weights as good as those that
-    there were before; what lights at rest show does not depend on them.
+    A light that is dragged is mostly like it was, but not always, and one or two lights tell little of more records:
+    what plausible lights bring to these samples counts too.
 
     Parameters
     ----------
@@ -50,18 +65,21 @@ class RestWeights:
 
     def __init__(
         self,
+        source: FitSource,
         snapshot: SceneSnapshot,
-        tracer: Tracer,
         view: ViewSamples,
         gather: GatherSamples,
         transport: Transport,
         names: tuple[str, ...],
     ) -> None:
         assert transport.interpolation is not None
+        self._training = source.training
         self._view, self._spread = view, transport.interpolation
         self._before = replace(self._spread, weights=self._spread.weights.copy())
-        self._lobes = [(lobe.name, lobe.tint) for lobe in transport.lobes if lobe.name in names]
-        self._builders = [RowBuilder(snapshot, tracer, gather, transport.seed + _OTHER_RAYS + half) for half in (0, 1)]
+        self._lobes = [lobe for lobe in transport.lobes if lobe.name in names]
+        self._builders = [
+            RowBuilder(snapshot, source.tracer, gather, transport.seed + _OTHER_RAYS + half) for half in (0, 1)
+        ]
         self._work: Iterator[None] | None = None
         self._is_done = False
 
@@ -98,8 +116,8 @@ class RestWeights:
             at_rows = products_of(light)
             at_rows = np.ascontiguousarray(at_rows.reshape(len(at_rows), -1, 4)[:, : self._spread.n_columns, :3])
             image, differs_here = np.zeros((self._view.n, 3), np.float32), np.zeros(self._view.n, np.float32)
-            for (_, tint), values in zip(self._lobes, at_rows, strict=True):
-                self._add_differences(tint, values, image, differs_here)
+            for lobe, values in zip(self._lobes, at_rows, strict=True):
+                self._add_differences(lobe.tint, values, image, differs_here)
                 yield
             square = np.mean(np.square(image, dtype=np.float64))
             if square > 0:
@@ -112,14 +130,30 @@ class RestWeights:
         if not len(samples):
             self._spread.weights[:] = self._before.weights
             return
-        columns = np.concatenate(shining, axis=1)
+        some = np.arange(0, self._view.n, max(1, self._view.n // _LEVEL_SAMPLES))
+        records = self._records_of(np.union1d(samples, some))
+        # Three at a time are the channels of one light.
+        training = np.ascontiguousarray(self._training[: len(self._training) // 3 * 3].T)
+        of_training = np.empty((len(self._lobes), len(records), training.shape[1]), np.float32)
+        for first in range(0, len(records), _RECORDS_TOGETHER):
+            part = slice(first, first + _RECORDS_TOGETHER)
+            for lobe, values in zip(self._lobes, of_training, strict=True):
+                values[part] = take_rows(lobe.rows, records[part]).matmul(training)
+            yield
+        given, shown = self._shown(some, records, of_training)
+        square = np.mean(np.square(np.einsum("nm,nmk->nk", given, shown)), axis=0)
+        share = 3 * TRAINING_SHARE / max(1, len(square)) / np.where(square > 0, square, np.inf)
+        factor = np.sqrt(share).astype(np.float32)
+        yield
+        at_records = np.concatenate([*(values[:, records] for values in products), factor * of_training], axis=2)
+        columns = np.concatenate([*shining, factor * training], axis=1)
         seen = np.empty((2, len(samples), columns.shape[1]), np.float32)
         for first in range(0, len(samples), _TOGETHER):
             for half, builder in enumerate(self._builders):
                 part = slice(first, first + _TOGETHER)
                 seen[half, part] = self._look(builder, samples[part], columns)
                 yield
-        self._put(samples, np.concatenate(products, axis=2), seen)
+        self._put(samples, records, at_records, seen)
 
     def _add_differences(self, tint: F32, at_rows: F32, image: F32, differs: F32) -> None:
         """Add what a lobe shows of a light, and the variance of its records at each sample, mean of the channels."""
@@ -132,32 +166,64 @@ class RestWeights:
         points = take_points(self._view.points, samples)
         rows = rows_of_points(builder, points, self._view.to_eye[samples], samples, RAYS)
         out = np.zeros((len(samples), light.shape[1]), np.float32)
-        for name, tint in self._lobes:
-            if name in rows:
-                out += np.tile(tint[samples], light.shape[1] // 3) * rows[name].matmul(light)
+        for lobe in self._lobes:
+            if lobe.name in rows:
+                out += _in_columns(lobe.tint[samples], light.shape[1]) * rows[lobe.name].matmul(light)
         return out
 
-    def _put(self, samples: I64, at_rows: F32, seen: F32) -> None:
-        """Take the weights that there were before, some samples' (ascending) towards what two estimates (2, n, k) say.
+    def _records_of(self, samples: I64) -> I64:
+        """Numbers of the records that some samples are made of, ascending."""
+        entries = _entries_of(self._before, samples)
+        return np.unique(self._before.indices[entries.place[entries.is_there]]).astype(np.int64)
+
+    def _shown(self, samples: I64, records: I64, at_records: F32) -> tuple[F64, F64]:
+        """Weights of the records of some samples (n, m), and what these would show with each alone: (n, m, k).
 
         Parameters
         ----------
-        at_rows : (n_lobes, n_rows, k)
+        records
+            Ascending; theirs are among them.
+        at_records : (n_lobes, n_records, k)
+            What shines on these.
         """
-        begin = self._spread.indptr[samples]
-        count = self._spread.indptr[samples + 1] - begin
-        entry = begin[:, None] + np.arange(count.max())
-        is_there = entry < (begin + count)[:, None]
-        entry = np.where(is_there, entry, begin[:, None])
-        given = np.where(is_there, self._before.weights[entry], 0).astype(np.float64)
-        shown = np.zeros((*entry.shape, seen.shape[2]))
-        for (_, tint), values in zip(self._lobes, at_rows, strict=True):
-            tints = np.tile(tint[samples], seen.shape[2] // 3)
-            shown += tints[:, None] * values[self._spread.indices[entry]]
-        shown *= is_there[:, :, None]
-        fitted = fitted_weights(given, shown, seen[0], seen[1])
+        entries = _entries_of(self._before, samples)
+        record = np.searchsorted(records, self._before.indices[entries.place])
+        shown = np.zeros((*record.shape, at_records.shape[2]))
+        for lobe, values in zip(self._lobes, at_records, strict=True):
+            shown += _in_columns(lobe.tint[samples], at_records.shape[2])[:, None] * values[record]
+        given = np.where(entries.is_there, self._before.weights[entries.place], 0).astype(np.float64)
+        return given, shown * entries.is_there[:, :, None]
+
+    def _put(self, samples: I64, records: I64, at_records: F32, seen: F32) -> None:
+        """Take the weights that there were before, some samples' (ascending) towards what two estimates (2, n, k) say.
+
+        `records` and `at_records` are those of `_shown`.
+        """
+        fitted = fitted_weights(*self._shown(samples, records, at_records), seen[0], seen[1])
+        entries = _entries_of(self._before, samples)
         self._spread.weights[:] = self._before.weights
-        self._spread.weights[entry[is_there]] = fitted[is_there]
+        self._spread.weights[entries.place[entries.is_there]] = fitted[entries.is_there]
+
+
+class _Entries(NamedTuple):
+    """Where in a table the entries of some of its rows are."""
+
+    place: I64  #: (n, most)
+    is_there: Bool  #: (n, most) False where a row has fewer
+
+
+def _entries_of(table: SparseRows, rows: I64) -> _Entries:
+    """All entries of some rows."""
+    begin = table.indptr[rows]
+    count = table.indptr[rows + 1] - begin
+    place = begin[:, None] + np.arange(count.max())
+    is_there = place < (begin + count)[:, None]
+    return _Entries(np.where(is_there, place, begin[:, None]), is_there)
+
+
+def _in_columns(tint: F32, n: int) -> F32:
+    """Tint (m, 3) of light in `n` columns, three of each light."""
+    return np.tile(tint, n // 3)
 
 
 def fitted_weights(given: F64, shown: F64, one: F32, other: F32) -> F64:

@@ -13,6 +13,7 @@ from icheat_usd.relight import RelitView
 from icheat_usd.relight.light_work import SparseView
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.relight.live import LiveRelighter
+from icheat_usd.relight.rest_weights import FitSource
 from icheat_usd.samples import ViewSamples
 from icheat_usd.scene import F32, F64, LightKind
 from icheat_usd.session.light_changes import light_of_stage
@@ -58,6 +59,9 @@ class Evaluator:
         held_back = None
         if rows is not None:
             held_back = HeldBack(parts.snapshot, parts.tracer, parts.view, parts.gather, rows)
+        # As the settings ask, not as these rows are: packed ones may come later, and end in the same image.
+        is_fitted = quality.record_error is not None and quality.packing_error is not None and not is_coarse
+        fit_source = FitSource(parts.tracer, parts.training) if is_fitted else None
         self.relighter = LiveRelighter(
             parts.snapshot,
             parts.view,
@@ -66,7 +70,7 @@ class Evaluator:
             self.lights,
             held_back=held_back,
             moving_detail=quality.moving_detail,
-            tracer=parts.tracer,
+            fit_source=fit_source,
         )
         # That bounces of more rays come of, once all that takes less is at rest.
         self._parts = None if is_coarse or not parts.has_rest_bounces else parts

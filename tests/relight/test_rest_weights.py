@@ -12,9 +12,9 @@ from scipy.optimize import nnls
 from icheat_usd.edits.model import EditStack
 from icheat_usd.relight import rest_weights
 from icheat_usd.relight.live import LiveRelighter
-from icheat_usd.relight.rest_weights import PRIOR, fitted_weights
+from icheat_usd.relight.rest_weights import PRIOR, TRAINING_SHARE, FitSource, fitted_weights
 from icheat_usd.scene import F32, F64, I64
-from icheat_usd.transport import Transport, build_transport
+from icheat_usd.transport import Transport, build_transport, training_radiance
 from tests.pipeline import Pipeline, select
 from tests.relight.test_live import RestingLights, packed_rows, poor, refined
 from tests.relight.test_operations import edit, room, soft
@@ -44,11 +44,18 @@ def converged() -> Transport:
     return build_transport(of.snapshot, of.tracer, of.view, of.gather, rays_per_row=8192, seed=77)
 
 
+@functools.cache
+def plausible() -> F32:
+    """Light that plausible lights make leave the cells, (24, n_gather)."""
+    of = sparse()
+    return training_radiance(of.snapshot, of.tracer, of.gather, of.bounces, 24)
+
+
 def relighter(*, fits: bool, stack: EditStack = STACK) -> LiveRelighter:
     of = sparse()
     rows = poor(packed_rows(of))
-    tracer = of.tracer if fits else None
-    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, RestingLights(of), tracer=tracer)
+    source = FitSource(of.tracer, plausible()) if fits else None
+    shown = LiveRelighter(of.snapshot, of.view, of.gather, rows, RestingLights(of), fit_source=source)
     shown.set_stack(stack)
     return shown
 
@@ -131,17 +138,40 @@ def test_weights_are_fitted_to_what_each_record_shows(monkeypatch):
     samples, exact, radiance = fitted_samples(shown), sparse().transport, sparse().cell_light.radiance
     spread = exact.interpolation
     scale = [np.sqrt(np.mean(exact.to_view(light).astype(np.float64) ** 2)) for light in radiance]
-    assert len(weights) == len(samples) and (one != other).any()
+    # Beside the two lights there are plausible ones, each in units of its image, which have a share together.
+    others = plausible().reshape(8, 3, -1).swapaxes(1, 2)
+    squares = [np.square(exact.to_view(np.ascontiguousarray(light)), dtype=np.float64).mean(axis=0) for light in others]
+    others = others * np.sqrt(TRAINING_SHARE / 8 / np.array(squares))[:, None]
     n_records = np.diff(spread.indptr)[samples]
     assert n_records.min() < n_records.max()
+    shining = np.concatenate([radiance / np.array(scale)[:, None, None], others]).astype(np.float32)
+    expected = np.zeros(at_records.shape)
     for i, sample in enumerate(samples):
         here = slice(*spread.indptr[sample : sample + 2])
         np.testing.assert_array_equal(weights[i, : n_records[i]], spread.weights[here])
-        assert not weights[i, n_records[i] :].any() and not at_records[i, n_records[i] :].any()
-        for record, seen in zip(spread.indices[here], at_records[i], strict=False):
-            parts = [[lobe.tint[sample] * (lobe.rows.rows(record, record + 1).matmul(light)[0] / level)
-                      for light, level in zip(radiance, scale, strict=True)] for lobe in exact.lobes]  # fmt: skip
-            np.testing.assert_allclose(seen, np.sum(parts, axis=0).ravel(), rtol=1e-4, atol=1e-6)
+        assert not weights[i, n_records[i] :].any()
+        for j, record in enumerate(spread.indices[here]):
+            parts = [[lobe.tint[sample] * lobe.rows.rows(record, record + 1).matmul(light)[0] for light in shining]
+                     for lobe in exact.lobes]  # fmt: skip
+            expected[i, j] = np.sum(parts, axis=0).ravel()
+    np.testing.assert_allclose(at_records, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_weights_suit_plausible_lights_too(monkeypatch):
+    """Two lights alone say little of what others would show: weights that fit them alone are worse for these."""
+    others = np.ascontiguousarray(plausible().reshape(8, 3, -1).swapaxes(1, 2))
+    exact = [converged().to_view(light) for light in others]
+    off = []
+    for share in (0.0, TRAINING_SHARE, 10.0):
+        monkeypatch.setattr(rest_weights, "TRAINING_SHARE", share)
+        shown = relighter(fits=True)
+        refined(shown)
+        samples, rows = fitted_samples(shown), shown.transport.source
+        assert isinstance(rows, Transport)
+        pairs = zip([rows.to_view(light) for light in others], exact, strict=True)
+        off.append(sum(errors(one, other, samples) / np.mean(np.square(other)) for one, other in pairs))
+    assert off[2] < off[1] < off[0]
+    assert off[2] < 0.8 * off[0]
 
 
 def test_lights_that_other_lights_do_not_reach_stay_at_0(monkeypatch):

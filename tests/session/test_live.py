@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,9 @@ import pytest
 
 from icheat_usd.errors import EditError, IcheatError
 from icheat_usd.kernels.assemble import sum_films
-from icheat_usd.session import Quality, Session
+from icheat_usd.relight.rest_weights import RestWeights
+from icheat_usd.session import Quality, Session, shot_parts
+from icheat_usd.session.disk_cache import DiskCache
 from icheat_usd.session.live import LiveSession
 from icheat_usd.session.live_events import Level, LiveEvent
 from tests.session.test_session import ROOM
@@ -136,6 +139,23 @@ def test_bounces_of_more_rays_come_once_lights_are_at_rest(stage: Path, quality:
         true = live.frame()
     off = {rays: np.linalg.norm(image - true) for rays, image in images.items()}
     assert 0 < off[256] < 0.6 * off[None]
+
+
+def test_rows_built_or_found_on_disk_end_in_the_same_image(
+    stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who builds them sees coarser ones first, and the packed ones later."""
+    fitted: list[int] = []
+    put = RestWeights._put
+    monkeypatch.setattr(RestWeights, "_put", lambda *values: (fitted.append(len(values[1])), put(*values)))
+    few_records = replace(PACKED, record_error=0.5)
+    images = []
+    for size in (0, 10**9, 10**9):
+        monkeypatch.setattr(shot_parts, "DiskCache", functools.partial(DiskCache, tmp_path / "cache", size))
+        with LiveSession.open(stage, width=40, height=30, quality=few_records) as live:
+            images.append(live.frame(level="rest"))
+    assert fitted == [fitted[0]] * 3 and fitted[0] > 0
+    np.testing.assert_array_equal(images, images[:1] * 3)
 
 
 def test_film_has_the_layers_of_a_relight_and_the_same_image(live: LiveSession) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from icheat_usd.edits.model import EditStack
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.relight.live import LiveRelighter
+from icheat_usd.relight.rest_weights import FitSource
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.session.document import Session
@@ -131,7 +132,8 @@ class Parts:
         """One that was never at rest."""
         detail = self.effort.settings().moving_detail
         scene = self.snapshot, self.view, self.gather, transport, self.lights
-        return LiveRelighter(*scene, moving_detail=detail, tracer=self.tracer)
+        source = FitSource(self.tracer, self._shot.training)
+        return LiveRelighter(*scene, moving_detail=detail, fit_source=source)
 
     def shown(self, light: int, *, at_rest: bool) -> F32:
         """Indirect light of every view sample under one light alone: at once, or when nothing is left to be done."""
