@@ -94,9 +94,9 @@ def test_every_way_to_import_a_helper_counts(tmp_path: Path, line: str) -> None:
     (tmp_path / "caller.py").write_text(line)
     (tmp_path / "helper.py").write_text("from icheat_usd.kernels import deeper")
     (tmp_path / "deeper.py").write_text("x = 1")
-    before = _jit.closure_digest("caller", tmp_path)
+    before = _jit.closure_digest(tmp_path / "caller.py", tmp_path)
     (tmp_path / "deeper.py").write_text("x = 2")
-    assert _jit.closure_digest("caller", tmp_path) != before
+    assert _jit.closure_digest(tmp_path / "caller.py", tmp_path) != before
 
 
 def test_libraries_options_and_the_processor_are_in_the_digest() -> None:
@@ -105,8 +105,21 @@ def test_libraries_options_and_the_processor_are_in_the_digest() -> None:
     numpy = pytest.importorskip("numpy")
     for part in (numpy.__version__, llvmlite.__version__, "CPU_NAME", "OPT=", sys.version.split()[0].rstrip("+")):
         assert part in facts
-    assert _jit.closure_digest("rows", facts=facts) == _jit.closure_digest("rows")
-    assert _jit.closure_digest("rows", facts=facts + "+avx9") != _jit.closure_digest("rows")
+    rows = Path(_jit.__file__).with_name("rows.py")
+    assert _jit.closure_digest(rows, facts=facts) == _jit.closure_digest(rows)
+    assert _jit.closure_digest(rows, facts=facts + "+avx9") != _jit.closure_digest(rows)
+
+
+def test_a_module_elsewhere_counts_with_the_kernel_modules_that_it_imports(tmp_path: Path) -> None:
+    folder = tmp_path / "kernels"
+    folder.mkdir()
+    (tmp_path / "other.py").write_text("from icheat_usd.kernels.helper import twice")
+    (folder / "helper.py").write_text("x = 1")
+    digests = [_jit.closure_digest(tmp_path / "other.py", folder)]
+    for file in (folder / "helper.py", tmp_path / "other.py"):
+        file.write_text(file.read_text() + "\ny = 1")
+        digests.append(_jit.closure_digest(tmp_path / "other.py", folder))
+    assert len(set(digests)) == 3
 
 
 @pytest.mark.parametrize("step", ["_save_index", "_save_data", "_load_index"])

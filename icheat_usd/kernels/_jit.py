@@ -88,19 +88,18 @@ def compiler_facts() -> str:
     return "\n".join(facts)
 
 
-def closure_digest(module: str, folder: Path = _KERNELS, facts: str | None = None) -> str:
-    """Digest of a kernel module, of all kernel modules behind it, and of `compiler_facts`."""
+def closure_digest(module: Path, folder: Path = _KERNELS, facts: str | None = None) -> str:
+    """Digest of a module with kernels, of all kernel modules behind it, and of `compiler_facts`."""
     digest = hashlib.sha256((compiler_facts() if facts is None else facts).encode())
-    pending, sources = [module], dict[str, bytes]()
+    pending, sources = [module], dict[Path, bytes]()
     while pending:
-        name = pending.pop()
-        path = folder / f"{name}.py"
-        if name in sources or not path.exists():
+        path = pending.pop()
+        if path in sources or not path.exists():
             continue
-        sources[name] = path.read_bytes()
-        pending.extend(sorted(_imported_kernel_modules(sources[name].decode())))
-    for name in sorted(sources):
-        digest.update(f"{name} {len(sources[name])}\n".encode() + sources[name])
+        sources[path] = path.read_bytes()
+        pending.extend(folder / f"{name}.py" for name in _imported_kernel_modules(sources[path].decode()))
+    for name, source in sorted((path.stem, source) for path, source in sources.items()):
+        digest.update(f"{name} {len(source)}\n".encode() + source)
     return digest.hexdigest()[:16]
 
 
@@ -111,7 +110,7 @@ class _FolderOfContents(caching._CacheLocator):  # type: ignore[misc]
     """Where Numba keeps what it compiles of one kernel."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
-        self._digest = _digest_of_module(function.__module__.rpartition(".")[2])
+        self._digest = _digest_of_module(Path(file))
         self._line = function.__code__.co_firstlineno
         self._py_file = file  # Numba names it in warnings.
 

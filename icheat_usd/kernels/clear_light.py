@@ -2,7 +2,8 @@
 
 From a ball of radiance ``L`` and radius ``r``, all of it above the horizon, a place gets ``pi L r^2 cos(theta) / d^2``;
 from a polygon ``L / 2`` times the sum over its edges of the angle that each fills times the cosine between the place's
-normal and that of the plane through the edge and the place (Lambert 1760; Baum, Rushmeier, Winget 1989, eq. 9).
+normal and that of the plane through the edge and the place (Lambert 1760; Baum, Rushmeier, Winget 1989, eq. 9). Where
+the horizon cuts a rectangle, its outline is closed along it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ BALL, RECTANGLE = 1, 2
 _TOO_FAR = np.float32(1.0 - 5e-4)
 # An edge that fills a larger angle than that of this cosine is too near: the place may lie on it.
 _TOO_NEAR = np.float32(-0.999)
+# Normals of a larger cosine are one.
+_FLAT = np.float32(1.0 - 1e-5)
 # An angle over 2 pi times its sine by its cosine, from 1 down to `_WIDE`: a Chebyshev fit, off by at most 3e-5.
 _WIDE = np.float32(-0.5)
 _ANGLE = (
@@ -33,7 +36,9 @@ _ANGLE = (
 
 @kernel
 def clear_light(form: np.ndarray, at: np.ndarray, lane: int) -> Any:
-    """Light on 16 places of a run, from number `lane`; 0 where it is not all above the horizon, or has no closed form.
+    """Light on 16 places of a run, from number `lane`; 0 where it has no closed form.
+
+    A ball has one where all of it is above the horizon, a rectangle is cut there.
 
     Parameters
     ----------
@@ -78,17 +83,84 @@ def _of_rectangle(form: np.ndarray, at: np.ndarray, skip: int) -> Any:
     a, b = _direction(_to(form, 2, at, skip)), _direction(_to(form, 5, at, skip))
     c, d = _direction(_to(form, 8, at, skip)), _direction(_to(form, 11, at, skip))
     ab, bc, cd, da = _dot(a, b), _dot(b, c), _dot(c, d), _dot(d, a)
-    widest = _least(ab, bc, cd, da)
-    is_wide = total(where_above(spread(_WIDE), widest, spread(np.float32(1.0)), zeros())) > 0.0
+    widest, one = _least(ab, bc, cd, da), spread(np.float32(1.0))
+    is_wide = total(where_above(spread(_WIDE), widest, one, zeros())) > 0.0
     edges = plus(
         plus(_edge(a, b, ab, is_wide, at, skip), _edge(b, c, bc, is_wide, at, skip)),
         plus(_edge(c, d, cd, is_wide, at, skip), _edge(d, a, da, is_wide, at, skip)),
     )
-    horizon = _least(_above(a, at, skip), _above(b, at, skip), _above(c, at, skip), _above(d, at, skip))
-    light = where_above(horizon, zeros(), product(spread(form[1]), edges), zeros())
-    light = where_above(widest, spread(_TOO_NEAR), light, zeros())
+    heights = _above(a, at, skip), _above(b, at, skip), _above(c, at, skip), _above(d, at, skip)
+    lowest = _least(heights[0], heights[1], heights[2], heights[3])
+    rest, closest = zeros(), widest
+    if total(where_above(lowest, zeros(), zeros(), where_above(_highest(heights), zeros(), one, zeros()))) > 0.0:
+        rest, closest = _of_cut_rectangle(a, b, c, d, at, skip)
+    edges, widest = where_above(lowest, zeros(), edges, rest), where_above(lowest, zeros(), widest, closest)
+    light = where_above(widest, spread(_TOO_NEAR), product(spread(form[1]), edges), zeros())
     light = where_above(spread(_TOO_FAR), _dot(a, c), light, zeros())
     return where_above(light, zeros(), light, zeros())
+
+
+@kernel
+def _of_cut_rectangle(a: Any, b: Any, c: Any, d: Any, at: np.ndarray, skip: int) -> Any:
+    """Sum over the edges of what of a rectangle is above the horizon, and the cosine of the widest of them.
+
+    By the directions of its corners; 0 where the two normals differ, which have horizons of their own.
+    """
+    bounds = _along(a, NORMAL, at, skip), _along(b, NORMAL, at, skip), _along(c, NORMAL, at, skip)
+    ha, hb, hc, hd = bounds[0], bounds[1], bounds[2], _along(d, NORMAL, at, skip)
+    nothing = zeros(), zeros(), zeros()
+    sinks, rises = _crossing(a, ha, b, hb, nothing, nothing)
+    sinks, rises = _crossing(b, hb, c, hc, sinks, rises)
+    sinks, rises = _crossing(c, hc, d, hd, sinks, rises)
+    sinks, rises = _crossing(d, hd, a, ha, sinks, rises)
+    one, ab = _cut_edge(a, ha, b, hb, sinks, rises, at, skip)
+    two, bc = _cut_edge(b, hb, c, hc, sinks, rises, at, skip)
+    three, cd = _cut_edge(c, hc, d, hd, sinks, rises, at, skip)
+    four, da = _cut_edge(d, hd, a, ha, sinks, rises, at, skip)
+    along = _dot(sinks, rises)
+    edges = plus(plus(plus(one, two), plus(three, four)), _edge(sinks, rises, along, True, at, skip))
+    normal = load(at[NORMAL] + skip), load(at[NORMAL + 1] + skip), load(at[NORMAL + 2] + skip)
+    is_flat = where_above(_along(normal, SHADING, at, skip), spread(_FLAT), edges, zeros())
+    widest = _least(ab, bc, cd, da)
+    return is_flat, where_above(along, widest, widest, along)
+
+
+@kernel
+def _crossing(a: Any, ha: Any, b: Any, hb: Any, sinks: Any, rises: Any) -> Any:
+    """Where the outline sinks below the horizon and where it rises, as known by now, after an edge from `a` to `b`."""
+    share = ratio(ha, minus(ha, hb))
+    x = multiply_add(share, minus(b[0], a[0]), a[0])
+    y = multiply_add(share, minus(b[1], a[1]), a[1])
+    way = _direction((x, y, multiply_add(share, minus(b[2], a[2]), a[2])))
+    return _if_crosses(ha, hb, way, sinks), _if_crosses(hb, ha, way, rises)
+
+
+@kernel
+def _if_crosses(above: Any, below: Any, new: Any, old: Any) -> Any:
+    """Where the first height is above 0 and the second is not, the one, else the other."""
+    x = where_above(above, zeros(), where_above(below, zeros(), old[0], new[0]), old[0])
+    y = where_above(above, zeros(), where_above(below, zeros(), old[1], new[1]), old[1])
+    return x, y, where_above(above, zeros(), where_above(below, zeros(), old[2], new[2]), old[2])
+
+
+@kernel
+def _cut_edge(
+    a: Any, ha: Any, b: Any, hb: Any, sinks: Any, rises: Any, at: np.ndarray, skip: int
+) -> Any:
+    """Share of what of an edge is above the horizon, and the cosine of its angle; 0 and 1 where nothing is."""
+    begin, end = _if_above(ha, a, rises), _if_above(hb, b, sinks)
+    cosine = _dot(begin, end)
+    edge = _edge(begin, end, cosine, True, at, skip)
+    is_there = where_above(ha, hb, ha, hb)
+    one = spread(np.float32(1.0))
+    return where_above(is_there, zeros(), edge, zeros()), where_above(is_there, zeros(), cosine, one)
+
+
+@kernel
+def _if_above(height: Any, a: Any, b: Any) -> Any:
+    """Where a height is above 0, a direction, else another."""
+    x, y = where_above(height, zeros(), a[0], b[0]), where_above(height, zeros(), a[1], b[1])
+    return x, y, where_above(height, zeros(), a[2], b[2])
 
 
 @kernel
@@ -131,3 +203,10 @@ def _above(a: Any, at: np.ndarray, skip: int) -> Any:
 def _least(a: Any, b: Any, c: Any, d: Any) -> Any:
     low, other = where_above(a, b, b, a), where_above(c, d, d, c)
     return where_above(low, other, other, low)
+
+
+@kernel
+def _highest(heights: Any) -> Any:
+    a, b, c, d = heights
+    high, other = where_above(a, b, a, b), where_above(c, d, c, d)
+    return where_above(high, other, high, other)

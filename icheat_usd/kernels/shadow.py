@@ -315,21 +315,29 @@ def _reflect(
             store(start + skip + c * RUN * 4, product(reflects, level))
     if len(colors) > 0:
         for j in range(RUN):
-            if chosen[j] >= 0:
-                for c in range(3):
-                    found[c, j] *= colors[chosen[j], c]
+            # Without a point, a place has no light, or that of all of a rectangle, which is of one colour.
+            for c in range(3):
+                found[c, j] *= colors[max(chosen[j], 0), c]
 
 
 @kernel
 def _take_whole(form: np.ndarray, at: np.ndarray, chosen: np.ndarray, state: np.ndarray, found: np.ndarray) -> None:
     """What all of a light brings for what is found of it by points, if none of a run's places is in its shadow."""
+    sees = False
     for j in range(RUN):
-        if chosen[j] >= 0 and state[j] != _CLEAR:
-            return
+        if chosen[j] >= 0:
+            if state[j] != _CLEAR:
+                return
+            sees = True
+    if not sees:
+        return
     light = address_of(found) + 3 * RUN * 4
     for lane in range(0, RUN, 16):
         whole = clear_light(form, at, lane)
         store(light + lane * 4, where_above(whole, zeros(), whole, load(light + lane * 4)))
+    # All points that a place looked at may be below its horizon, though not all of the light is.
+    for j in range(RUN):
+        state[j] = _CLEAR if chosen[j] < 0 and found[3, j] > _ZERO else state[j]
 
 
 @kernel

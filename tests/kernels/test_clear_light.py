@@ -102,7 +102,39 @@ def test_places_that_have_all_of_a_light_above_their_horizon_get_what_its_points
     whole = (lowest > 0.01) & (expected > 0) & (size(light, position) > 0.033)
     assert whole.sum() > 6
     np.testing.assert_allclose(light_at[whole], expected[whole], rtol=2e-3)
-    assert (light_at[lowest < -0.01] == 0).all() and (light_at[expected == 0] == 0).all()
+    assert (light_at[expected == 0] == 0).all()
+    if light is BALL:
+        assert (light_at[lowest < -0.01] == 0).all()
+
+
+@pytest.mark.parametrize("to_world", [TURNED, MIRRORED])
+@pytest.mark.parametrize("size", [(0.9, 0.2), (0.3, 1.4)])
+def test_places_whose_horizon_cuts_a_rectangle_get_what_the_points_above_it_add_up_to(
+    to_world: F32, size: tuple[float, float]
+) -> None:
+    light = Light(LightKind.RECT, (3, 2, 1), to_world, size)
+    n_corners_above = set()
+    for seed in range(3):
+        position, normal = places(light, 0.2, 1.5, seed)
+        normal[::2] *= -1  # the middle of the light is below their horizon
+        expected, lowest = summed(light, position, normal)
+        corners = points_of(light, 2)[0] - to_world[:, 3]
+        heights = (to_world[:, 3] + 2 * corners - position[:, None]) @ normal[:, :, None]
+        is_cut = (lowest < -0.02) & (heights.max(axis=(1, 2)) > 0.02) & (expected > 0.01)
+        light_at = found(light, position, normal)[is_cut]
+        n_corners_above.update(np.sum(heights[is_cut] > 0, axis=(1, 2)))
+        # Next to an edge there is none.
+        assert np.mean(light_at > 0) > 0.9
+        np.testing.assert_allclose(light_at[light_at > 0], expected[is_cut][light_at > 0], rtol=1e-2)
+    assert n_corners_above >= {1, 2, 3}
+
+
+def test_where_the_horizon_of_one_normal_alone_cuts_a_rectangle_there_is_none() -> None:
+    position = RECT.to_world[:, 3] + np.array([[0.0, -1.5, 0.0]])
+    up, flat = np.array([[0.0, 1.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
+    assert found(RECT, position, flat) > 0 and found(RECT, position, up) > 0
+    for normal, shading in ((up, flat), (flat, up)):
+        assert found(RECT, position, normal, shading) == 0
 
 
 def test_next_to_a_long_edge_of_which_it_sees_nearly_half_a_turn_a_place_gets_as_much() -> None:

@@ -31,7 +31,7 @@ from icheat_usd.lighting.quick import (
     shining_points,
 )
 from icheat_usd.lighting.sampler import prepare_light_sampler
-from icheat_usd.materials import points_on_surface
+from icheat_usd.materials import points_on_surface, take_points
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import build_tracer, transmittance
 from icheat_usd.tracing.embree import EmbreeTracer
@@ -419,6 +419,18 @@ def test_by_its_form_a_light_that_nothing_hides_has_no_noise(name: str, share_ra
     look, expected = by_form(WHOLE[name], points, share_rays, blocker=False)
     np.testing.assert_allclose(look, expected, rtol=0.03)
     assert np.sqrt(((look - expected) ** 2).sum() / (expected**2).sum()) < 0.01
+
+
+@pytest.mark.parametrize("height", [0.0, -0.4])
+def test_a_rectangle_that_stands_in_a_floor_has_no_noise_beside_it(height: float) -> None:
+    """Also where places look at points below the floor alone."""
+    light = Light(LightKind.RECT, (3, 2, 1), translation(0.0, height, 0.5)[:3], (1.0, 1.0))  # shines to -Z
+    points = on_floor(scene(light, Material(0.5)), 2000)
+    # Nearer, the points of the light are too few.
+    points = take_points(points, np.flatnonzero(points.position[:, 2] < -0.1))
+    look, expected = by_form(light, points, False, blocker=False)
+    assert np.sqrt(((look - expected) ** 2).sum() / (expected**2).sum()) < 0.02
+    assert look.sum() == pytest.approx(expected.sum(), rel=0.005)
 
 
 @pytest.mark.parametrize("name", WHOLE)
