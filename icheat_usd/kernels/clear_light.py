@@ -89,10 +89,10 @@ def _of_rectangle(form: np.ndarray, at: np.ndarray, skip: int) -> Any:
         plus(_edge(a, b, ab, is_wide, at, skip), _edge(b, c, bc, is_wide, at, skip)),
         plus(_edge(c, d, cd, is_wide, at, skip), _edge(d, a, da, is_wide, at, skip)),
     )
-    heights = _above(a, at, skip), _above(b, at, skip), _above(c, at, skip), _above(d, at, skip)
-    lowest = _least(heights[0], heights[1], heights[2], heights[3])
+    ha, hb, hc, hd = _above(a, at, skip), _above(b, at, skip), _above(c, at, skip), _above(d, at, skip)
+    lowest, highest = _least(ha, hb, hc, hd), _highest(ha, hb, hc, hd)
     rest, closest = zeros(), widest
-    if total(where_above(lowest, zeros(), zeros(), where_above(_highest(heights), zeros(), one, zeros()))) > 0.0:
+    if total(where_above(lowest, zeros(), zeros(), where_above(highest, zeros(), one, zeros()))) > 0.0:
         rest, closest = _of_cut_rectangle(a, b, c, d, at, skip)
     edges, widest = where_above(lowest, zeros(), edges, rest), where_above(lowest, zeros(), widest, closest)
     light = where_above(widest, spread(_TOO_NEAR), product(spread(form[1]), edges), zeros())
@@ -106,8 +106,8 @@ def _of_cut_rectangle(a: Any, b: Any, c: Any, d: Any, at: np.ndarray, skip: int)
 
     By the directions of its corners; 0 where the two normals differ, which have horizons of their own.
     """
-    bounds = _along(a, NORMAL, at, skip), _along(b, NORMAL, at, skip), _along(c, NORMAL, at, skip)
-    ha, hb, hc, hd = bounds[0], bounds[1], bounds[2], _along(d, NORMAL, at, skip)
+    ha, hb = _along(a, NORMAL, at, skip), _along(b, NORMAL, at, skip)
+    hc, hd = _along(c, NORMAL, at, skip), _along(d, NORMAL, at, skip)
     nothing = zeros(), zeros(), zeros()
     sinks, rises = _crossing(a, ha, b, hb, nothing, nothing)
     sinks, rises = _crossing(b, hb, c, hc, sinks, rises)
@@ -120,9 +120,9 @@ def _of_cut_rectangle(a: Any, b: Any, c: Any, d: Any, at: np.ndarray, skip: int)
     along = _dot(sinks, rises)
     edges = plus(plus(plus(one, two), plus(three, four)), _edge(sinks, rises, along, True, at, skip))
     normal = load(at[NORMAL] + skip), load(at[NORMAL + 1] + skip), load(at[NORMAL + 2] + skip)
-    is_flat = where_above(_along(normal, SHADING, at, skip), spread(_FLAT), edges, zeros())
     widest = _least(ab, bc, cd, da)
-    return is_flat, where_above(along, widest, widest, along)
+    widest = where_above(along, widest, widest, along)
+    return where_above(_along(normal, SHADING, at, skip), spread(_FLAT), edges, zeros()), widest
 
 
 @kernel
@@ -144,16 +144,13 @@ def _if_crosses(above: Any, below: Any, new: Any, old: Any) -> Any:
 
 
 @kernel
-def _cut_edge(
-    a: Any, ha: Any, b: Any, hb: Any, sinks: Any, rises: Any, at: np.ndarray, skip: int
-) -> Any:
+def _cut_edge(a: Any, ha: Any, b: Any, hb: Any, sinks: Any, rises: Any, at: np.ndarray, skip: int) -> Any:
     """Share of what of an edge is above the horizon, and the cosine of its angle; 0 and 1 where nothing is."""
     begin, end = _if_above(ha, a, rises), _if_above(hb, b, sinks)
     cosine = _dot(begin, end)
     edge = _edge(begin, end, cosine, True, at, skip)
-    is_there = where_above(ha, hb, ha, hb)
-    one = spread(np.float32(1.0))
-    return where_above(is_there, zeros(), edge, zeros()), where_above(is_there, zeros(), cosine, one)
+    highest, one = where_above(ha, hb, ha, hb), spread(np.float32(1.0))
+    return where_above(highest, zeros(), edge, zeros()), where_above(highest, zeros(), cosine, one)
 
 
 @kernel
@@ -206,7 +203,6 @@ def _least(a: Any, b: Any, c: Any, d: Any) -> Any:
 
 
 @kernel
-def _highest(heights: Any) -> Any:
-    a, b, c, d = heights
+def _highest(a: Any, b: Any, c: Any, d: Any) -> Any:
     high, other = where_above(a, b, a, b), where_above(c, d, c, d)
     return where_above(high, other, high, other)

@@ -503,8 +503,8 @@ def light_places(
     first_point : (n_groups + `RUN`,) int32, number of the first point of each group
     colors : (m, 3) float32, colour of each point; none: all are white
     form : (n,) float32
-        Of the light, as `clear_light` has it: places that have all of it above their horizon count what all of it
-        brings; of a ball where they see the point they chose, of a rectangle where all of their run see theirs. None:
+        Of the light, as `clear_light` has it: places count what all of it brings that is above their horizon, of a ball
+        where they see the point they chose and it is whole, of a rectangle where all of their run see theirs. None:
         the mean of the points.
     light : (4, 3) float32, least and largest place of the points, and least and largest normal
     turn : int
