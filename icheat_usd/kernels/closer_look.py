@@ -19,46 +19,46 @@ def _level(direct: np.ndarray, cell: int) -> float:
 
 
 @parallel_kernel
-def noise_of_runs(direct: np.ndarray, area: np.ndarray, begin: np.ndarray, end: np.ndarray, out: np.ndarray) -> None:
-    """Squared differences of the light that runs of cells send from their mean, summed.
+def noise_of_runs(direct: np.ndarray, weight: np.ndarray, begin: np.ndarray, end: np.ndarray, out: np.ndarray) -> None:
+    """Squared differences of the light that runs of cells send from their weighted mean, summed.
 
     Parameters
     ----------
-    direct : (n_cells, 3), area : (n_cells,)
+    direct : (n_cells, 3), weight : (n_cells,)
     begin, end : (n_runs,) int64
         Cells of each run, which may share the one between them.
     out : (2, n_runs) float64, set
-        Sums of ``(area * (level - mean)) ** 2``, and of ``area * level``.
+        Sums of ``(weight * (level - mean)) ** 2``, and of ``weight * level``.
     """
     for run in prange(len(begin)):
         total, size = 0.0, 0.0
         for cell in range(begin[run], end[run]):
-            total += area[cell] * _level(direct, cell)
-            size += area[cell]
+            total += weight[cell] * _level(direct, cell)
+            size += weight[cell]
         mean, noise = total / size if size > 0.0 else 0.0, 0.0
         for cell in range(begin[run], end[run]):
-            noise += (area[cell] * (_level(direct, cell) - mean)) ** 2
+            noise += (weight[cell] * (_level(direct, cell) - mean)) ** 2
         out[0, run], out[1, run] = noise, total
 
 
 @parallel_kernel
 def add_changes_of_runs(
-    direct: np.ndarray, before: np.ndarray, area: np.ndarray, begin: np.ndarray, end: np.ndarray, out: np.ndarray
+    direct: np.ndarray, before: np.ndarray, weight: np.ndarray, begin: np.ndarray, end: np.ndarray, out: np.ndarray
 ) -> None:
     """Add the squared differences of the light of runs of cells from what it was.
 
     Parameters
     ----------
-    direct, before : (n_cells, 3), area : (n_cells,)
+    direct, before : (n_cells, 3), weight : (n_cells,)
     begin, end : (n_runs,) int64
         As `noise_of_runs` has them.
     out : (n_runs,) float64
-        Sums of ``(area * (level - level before)) ** 2`` are added.
+        Sums of ``(weight * (level - level before)) ** 2`` are added.
     """
     for run in prange(len(begin)):
         change = 0.0
         for cell in range(begin[run], end[run]):
-            change += (area[cell] * (_level(direct, cell) - _level(before, cell))) ** 2
+            change += (weight[cell] * (_level(direct, cell) - _level(before, cell))) ** 2
         out[run] += change
 
 

@@ -92,18 +92,24 @@ def _sample_spherical_rectangle(
 
 
 @kernel
+def place_in_rect(frame: Floats, u1: float, u2: float) -> Floats:
+    """Where in [0, 1]^2 a rect is looked at from the point that `rect_frame` sees it from, evenly in solid angle."""
+    ex, ey, x0, y0, depth, b0, b1, k, solid_angle = frame
+    if solid_angle <= 0.0:
+        return u1, u2
+    xu, yv = _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, -depth, x0 + ex, y0 + ey, u1, u2)
+    return (xu - x0) / ex, (yv - y0) / ey
+
+
+@kernel
 def _sample_rect(
     m: Floats, width: float, height: float, px: float, py: float, pz: float, u1: float, u2: float
 ) -> Floats:
-    ex, ey, x0, y0, depth, b0, b1, k, solid_angle = rect_frame(m, width, height, px, py, pz)
+    frame = rect_frame(m, width, height, px, py, pz)
+    depth, solid_angle = frame[4], frame[8]
     if depth <= 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    x = u1
-    y = u2
-    if solid_angle > 0.0:
-        xu, yv = _sample_spherical_rectangle(b0, b1, k, solid_angle, x0, y0, -depth, x0 + ex, y0 + ey, u1, u2)
-        x = (xu - x0) / ex
-        y = (yv - y0) / ey
+    x, y = place_in_rect(frame, u1, u2)
     sx = (x - 0.5) * width
     sy = (y - 0.5) * height
     dx = m[3] - px + m[0] * sx + m[1] * sy

@@ -26,11 +26,12 @@ from numba import prange
 
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.clear_light import RECTANGLE, clear_light
-from icheat_usd.kernels.embree import PACKET, call_packet
+from icheat_usd.kernels.embree import PACKET
 from icheat_usd.kernels.lanes import minus, where_above
 from icheat_usd.kernels.place_columns import COLUMNS, EDGE, ORIGIN, RUN, SPECULAR, TINT
+from icheat_usd.kernels.place_rays import BLOCKED, CLEAR, THROUGH, find_columns, prepare_packet, trace_rows
 from icheat_usd.kernels.random import hash_combine, hash_u32, to_unit
-from icheat_usd.kernels.shadow_lanes import CANDIDATE, keep_near_boxes, look, shine
+from icheat_usd.kernels.shadow_lanes import CANDIDATE, look, shine
 from icheat_usd.kernels.simd import address_of, fetch, load, multiply_add, plus, product, spread, store, zeros
 
 STRIDE = 29  #: groups of points from a place to the next: neighbours look at different parts of the light
@@ -44,9 +45,6 @@ STATES = 4  #: a place knows STATES * point + state
 TURNED, APPEARED, BURIED = 1, 2, 4
 _LEAST_ALIKE = RUN // 8  # places of a run that tell how a point that came out looks to the others
 _RUNS = 16  # of a task, whose rays fill packets together
-_INVALID = np.uint32(0xFFFFFFFF)
-_STOP_SHORT = np.float32(1.0 - 1e-4)  # as for other shadow rays: lights may lie in the plane of a ceiling
-_BLOCKED, _CLEAR, _THROUGH = 0, 1, 2
 _STILL_THROUGH = 3  # in a look alone: as it was known, and no ray was sent
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _FOUND = 4  # rows of what a run finds: direction to the chosen point (for distant lights) or way to it, and light
@@ -78,50 +76,6 @@ def is_turned_away(bounds: np.ndarray, light: np.ndarray, distant: bool) -> bool
 
 
 @kernel
-def _prepare_packet(rays: np.ndarray) -> None:
-    """What all packets of shadow rays (22, 16) have in common, which tracing leaves as it is."""
-    words = rays.view(np.uint32)
-    for lane in range(16):
-        rays[3, lane] = _ZERO
-        rays[7, lane] = _ZERO
-        words[9, lane] = _INVALID
-        words[10, lane] = 0
-        words[11, lane] = 0
-
-
-@kernel
-def _trace(
-    function: int, arguments: int, opaque: int, passing: int, boxes: np.ndarray, distant: bool, columns: np.ndarray,
-    column: np.ndarray, runs: np.ndarray, found: np.ndarray, rays: np.ndarray, valid: np.ndarray, rows: np.ndarray,
-    n: int, state: np.ndarray,
-) -> None:  # fmt: skip
-    """Shadow rays of the first `n` rows of some runs, in packets of 16; their `state` is set."""
-    limit = np.float32(np.inf) if distant else _STOP_SHORT
-    for begin in range(0, n, 16):
-        count = min(16, n - begin)
-        for lane in range(16):
-            valid[lane] = -1 if lane < count else 0
-            k, j = divmod(np.uint32(rows[begin + min(lane, count - 1)]), np.uint32(RUN))
-            for c in range(3):
-                rays[c, lane] = columns[column[runs[k], ORIGIN + c], j]
-                rays[4 + c, lane] = found[k, c, j]
-            rays[8, lane] = limit
-        call_packet(function, address_of(valid), opaque, address_of(rays), arguments)
-        for lane in range(count):
-            state[rows[begin + lane]] = _CLEAR if rays[8, lane] >= _ZERO else _BLOCKED
-        if passing == 0:
-            continue
-        for lane in range(count):
-            valid[lane] = -1 if rays[8, lane] >= _ZERO else 0
-        if not keep_near_boxes(boxes, rays, valid):
-            continue
-        call_packet(function, address_of(valid), passing, address_of(rays), arguments)
-        for lane in range(count):
-            if valid[lane] != 0 and rays[8, lane] < _ZERO:
-                state[rows[begin + lane]] = _THROUGH
-
-
-@kernel
 def _alike(known: np.ndarray, told: np.ndarray) -> int:
     """How a run saw the points of which nothing is told: a state, if there was one alone, else -1; -2: too few tell."""
     met, n = 0, 0
@@ -139,14 +93,14 @@ def _alike(known: np.ndarray, told: np.ndarray) -> int:
         return -1
     if n < _LEAST_ALIKE or met == 0:
         return -2
-    return _BLOCKED if met == 1 << _BLOCKED else _CLEAR if met == 1 << _CLEAR else _THROUGH
+    return BLOCKED if met == 1 << BLOCKED else CLEAR if met == 1 << CLEAR else THROUGH
 
 
 @kernel
 def _foretold(point: int, told: np.ndarray, alike: int) -> int:
     """State of a point that has turned, as far as others tell; -1: they do not."""
     if told[point] & BURIED != 0:
-        return _BLOCKED
+        return BLOCKED
     return max(alike, -1) if told[point] & APPEARED != 0 else -1
 
 
@@ -157,25 +111,25 @@ def _ask(
 ) -> None:  # fmt: skip
     """Which places of a run send a ray at first, and what the others know; `chosen` is -1 where there is no point."""
     if phase >= 0:
-        part = (_MIXED_PART if alike == -1 or alike == _THROUGH else SHARED_PART if share_rays else PART) - 1
+        part = (_MIXED_PART if alike == -1 or alike == THROUGH else SHARED_PART if share_rays else PART) - 1
         for j in range(len(known)):
             same = known[j] >> 2 == chosen[j]
-            was = _STILL_THROUGH if known[j] & 3 == _THROUGH else known[j] & 3
-            state[j] = was if same and chosen[j] >= 0 else _BLOCKED
+            was = _STILL_THROUGH if known[j] & 3 == THROUGH else known[j] & 3
+            state[j] = was if same and chosen[j] >= 0 else BLOCKED
             asks[j] = 1 if chosen[j] >= 0 and (not same or (j ^ phase) & part == 0) else 0
         if len(told) > 0:
             for j in range(len(known)):
                 if chosen[j] >= 0 and told[chosen[j]] & TURNED != 0:
                     foretold = _foretold(chosen[j], told, alike)
-                    state[j] = max(foretold, _BLOCKED)
+                    state[j] = max(foretold, BLOCKED)
                     asks[j] |= foretold < 0
                 elif chosen[j] >= 0 and told[chosen[j]] & BURIED != 0:
-                    asks[j] |= state[j] != _BLOCKED
+                    asks[j] |= state[j] != BLOCKED
         for j in range(len(known), RUN):
-            state[j], asks[j] = _BLOCKED, 0
+            state[j], asks[j] = BLOCKED, 0
     else:
         for j in range(RUN):
-            state[j] = _BLOCKED
+            state[j] = BLOCKED
             asks[j] = 1 if chosen[j] >= 0 and (not share_rays or (j & (_MIXED_PART - 1)) == 0) else 0
 
 
@@ -198,13 +152,13 @@ def _doubt(
         return doubted
     if not share_rays:
         return 0
-    common = state[rows[0] - offset] if len(rows) >= RUN // 8 else _THROUGH
+    common = state[rows[0] - offset] if len(rows) >= RUN // 8 else THROUGH
     for q in range(len(rows)):
-        common = common if state[rows[q] - offset] == common else _THROUGH
+        common = common if state[rows[q] - offset] == common else THROUGH
     for j in range(RUN):
         if chosen[j] >= 0 and (j & (_MIXED_PART - 1)) != 0:
             state[j] = common
-    return every if common == _THROUGH else 0
+    return every if common == THROUGH else 0
 
 
 @kernel
@@ -233,7 +187,7 @@ def _meet(
         alike[k] = _alike(knows, told)
         _ask(chosen[k], share_rays, phase, knows, told, alike[k], state[k], asks[k])
         begin[k + 1] = _append_rows(asks[k], k * RUN, begin[k], rows)
-    _trace(*way, rows, begin[n], every_state)
+    trace_rows(*way, rows, begin[n], every_state)
     count = 0
     for k in range(n):
         offset = k * RUN
@@ -244,7 +198,7 @@ def _meet(
             for j in range(RUN):
                 asks[k, j] = 1 if doubted >> j // _BESIDE & 1 != 0 and chosen[k, j] >= 0 and asks[k, j] == 0 else 0
             count = _append_rows(asks[k], offset, count, others)
-    _trace(*way, others, count, every_state)
+    trace_rows(*way, others, count, every_state)
 
 
 @kernel
@@ -272,8 +226,8 @@ def tell_points(
             continue
         point = new >> 2
         looks[point] += 1
-        sees[point] += 1 if new & 3 != _BLOCKED else 0
-        if old >= 0 and old >> 2 == point and (old | new) & 3 != _BLOCKED:
+        sees[point] += 1 if new & 3 != BLOCKED else 0
+        if old >= 0 and old >> 2 == point and (old | new) & 3 != BLOCKED:
             both[point] += 1
             others[point] += 1 if old != new else 0
     for point in range(len(told)):
@@ -294,7 +248,7 @@ def _reflect(
     """
     levels, n_lit = found[3], np.int32(0)
     for j in range(RUN):
-        levels[j] = levels[j] if state[j] != _BLOCKED else _ZERO
+        levels[j] = levels[j] if state[j] != BLOCKED else _ZERO
         n_lit += state[j]
     if n_lit == 0:
         found[:3] = _ZERO
@@ -326,7 +280,7 @@ def _take_whole(form: np.ndarray, at: np.ndarray, chosen: np.ndarray, state: np.
     sees = False
     for j in range(RUN):
         if chosen[j] >= 0:
-            if state[j] != _CLEAR:
+            if state[j] != CLEAR:
                 return
             sees = True
     if not sees:
@@ -337,7 +291,7 @@ def _take_whole(form: np.ndarray, at: np.ndarray, chosen: np.ndarray, state: np.
         store(light + lane * 4, where_above(whole, zeros(), whole, load(light + lane * 4)))
     # All points that a place looked at may be below its horizon, though not all of the light is.
     for j in range(RUN):
-        state[j] = _CLEAR if chosen[j] < 0 and found[3, j] > _ZERO else state[j]
+        state[j] = CLEAR if chosen[j] < 0 and found[3, j] > _ZERO else state[j]
 
 
 @kernel
@@ -353,13 +307,6 @@ def _get_nothing(run: int, row: np.ndarray, out: np.ndarray, through: np.ndarray
     if len(known) > 0:
         for i in range(begin, end):
             known[i] = -1
-
-
-@kernel
-def _find_columns(columns: int, column: np.ndarray, run: int, at: np.ndarray) -> None:
-    """Addresses of the columns of a run, from that of all."""
-    for c in range(COLUMNS):
-        at[c] = columns + np.int64(column[run, c]) * (RUN * 4)
 
 
 @kernel
@@ -398,7 +345,7 @@ def _light_runs(
     for j in range(RUN):
         # multiples of the golden ratio are spread evenly, modulo 1, however many of them there are
         numbers[j] = np.float32((j * 0.6180339887498949) % 1.0)
-    _prepare_packet(rays)
+    prepare_packet(rays)
     of_turn, groups = hash_combine(seed, turn), width - RUN
     below_one, one = spread(np.float32(1.0 - 2.0**-24)), spread(_ONE)
     n = 0
@@ -410,7 +357,7 @@ def _light_runs(
             _get_nothing(run, row, out, through, known)
             continue
         _fetch_columns(every_column, column, run, before, TINT, COLUMNS)
-        _find_columns(every_column, column, run, at)
+        find_columns(every_column, column, run, at)
         before = run
         k, runs[n] = n, run
         n += 1
@@ -433,7 +380,7 @@ def _light_runs(
     )  # fmt: skip
     for k in range(n):
         run = runs[k]
-        _find_columns(every_column, column, run, at)
+        find_columns(every_column, column, run, at)
         if len(form) > 0 and form[0] == RECTANGLE:
             _take_whole(form, at, chosen[k], state[k], found[k])
         _reflect(colors, at, lobes[run] != 0, diffuse, specular, found[k], chosen[k], state[k], room)
@@ -444,12 +391,12 @@ def _light_runs(
             out[target, 0], out[target, 1], out[target, 2] = red[j], green[j], blue[j]
         if len(through) > 0:
             for j in range(size):
-                sign = 1 if state[k, j] == _THROUGH else -1 if state[k, j] == _STILL_THROUGH else 0
+                sign = 1 if state[k, j] == THROUGH else -1 if state[k, j] == _STILL_THROUGH else 0
                 through[of_run + j] = sign * (1 + chosen[k, j])
         if len(known) > 0:
             knows = known[of_run : of_run + size]
             for j in range(size):
-                knows[j] = STATES * chosen[k, j] + min(state[k, j], _THROUGH) if chosen[k, j] >= 0 else -1
+                knows[j] = STATES * chosen[k, j] + min(state[k, j], THROUGH) if chosen[k, j] >= 0 else -1
     storage[0] = _ZERO  # Numba may free an array after its last mention, and addresses do not count.
     numbers[0] = _ZERO
 

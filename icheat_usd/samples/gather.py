@@ -44,6 +44,7 @@ class GatherSamples:
 
     points: SurfacePoints  #: (n,) in the order of the tree's leaves
     area: F32  #: (n,) of the cells, square metres
+    importance: F32  #: (n,) part of what the view receives that comes from each cell, by the pilot, if all shine alike
     number: I64  #: (n,) what random numbers go by: the same when other surfaces get more samples, or less
     tree: ClusterTree
     patch_points: SurfacePoints  #: (p,) sorted by cell: places that were seen, and some by area
@@ -144,6 +145,7 @@ def gather_samples(
     identity += points.face_uv.astype("<f4").tobytes()
     tree = build_tree(shape, cell_area, identity)
     cell_seen = locator.locate(seen.position, seen.normal, seen.instance, seen.side)
+    received = np.bincount(cell_seen, weight, minlength=len(count))
     used_seen, used = _patches_used(cell_seen, number, cell, n_patches_per_cell)
     patches = concatenate_points(take_points(seen, used_seen), take_points(patches, used))
     cell = np.concatenate([cell_seen[used_seen], cell[used]])
@@ -152,6 +154,7 @@ def gather_samples(
     return GatherSamples(
         points=points,
         area=cell_area.astype(np.float32),
+        importance=(received / max(received.sum(), 1e-30)).astype(np.float32),
         number=_numbers(slots)[shape.order],
         tree=tree,
         patch_points=take_points(patches, by_cell),

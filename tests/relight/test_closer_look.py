@@ -75,7 +75,7 @@ def test_a_sun_that_turns_is_as_well_known_as_at_a_first_look() -> None:
     assert np.mean(moved) < 1.1 * np.mean(first)
 
 
-@pytest.mark.parametrize(("n_runs", "what"), [(24, "what was known at rest"), (96, "what lies beside in space")])
+@pytest.mark.parametrize(("n_runs", "what"), [(12, "what was known at rest"), (96, "what lies beside in space")])
 def test_borders_of_a_sun_are_found_by(n_runs: int, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not all runs are looked at, so that it matters which."""
     monkeypatch.setattr(closer_look, "MOST_RUNS_OF_SUN", n_runs)
@@ -102,22 +102,28 @@ def test_borders_of_a_sun_are_found_by(n_runs: int, what: str, monkeypatch: pyte
 
 
 def test_where_a_sun_was_long_ago_is_not_looked_at_for_ever() -> None:
-    """What a closer look found there is known from then on."""
+    """What a closer look found there is known from then on: hardly more is looked at than if it never was there."""
     sun, far = (Light(LightKind.DISTANT, (3, 3, 3), rotation((0, 1, 0), k)[:3], (0.01, 0.0)) for k in (35, -35))
-    pipeline = Pipeline(room(sun), n_gather=2048)
-    lights = first_look(pipeline, 0)
-    while lights.refine():
-        pass
-    n_looked_at = []
-    for _ in range(3):
-        lights.change(0, to_world=far.to_world)
-        following = lights._lights[0].following
-        assert following is not None and following.patches is not None
-        n_looked_at.append(int(following.patches._looked_at.sum()))
-    fresh = first_look(Pipeline(room(far), n_gather=2048), 0)._lights[0].following
-    assert fresh is not None and fresh.patches is not None
-    assert n_looked_at[0] > 1.2 * n_looked_at[-1] > 0
-    assert n_looked_at[-1] <= 1.1 * fresh.patches._looked_at.sum()
+    rested, other = Pipeline(room(sun), n_gather=2048), Pipeline(room(far), n_gather=2048)
+    counts = []
+    for seed in range(4):
+        lights = first_look(rested, seed)
+        while lights.refine():
+            pass
+        n_looked_at = [n_runs_of_closer_look(first_look(other, seed))]
+        for _ in range(3):
+            lights.change(0, to_world=far.to_world)
+            n_looked_at.append(n_runs_of_closer_look(lights))
+        counts.append(n_looked_at)
+    fresh, first, _, last = np.mean(counts, axis=0)
+    assert first > 1.2 * last > 0
+    assert last - fresh < 0.25 * (first - fresh)
+
+
+def n_runs_of_closer_look(lights: LiveLights) -> int:
+    following = lights._lights[0].following
+    assert following is not None and following.patches is not None
+    return int(following.patches._looked_at.sum())
 
 
 def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,12 +133,12 @@ def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lights._around.patches is not None
     look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
     even = np.ones((pipeline.gather.n, 3), np.float32)
-    assert len(look._noisy_runs(even)[1]) == len(look._border_runs(even)[1]) == 0
-    assert len(look._worst_runs(even, 1.0, np.arange(4, dtype=np.int32))) == 0
+    assert len(look._noisy_runs(even)) == len(look._border_runs(even)) == 0
+    assert len(look._worst_runs(even, np.arange(4, dtype=np.int32), pipeline.gather.importance)) == 0
     monkeypatch.setattr(closer_look, "MOST_RUNS", 2)
     spotted = even.copy()
     spotted[::50] = 9.0
-    assert 2 < len(look._noisy_runs(spotted)[1]) <= 6
+    assert 2 < len(look._noisy_runs(spotted)) <= 6
 
 
 def test_noise_of_runs_is_that_of_a_plain_loop() -> None:

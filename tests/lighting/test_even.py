@@ -1,0 +1,98 @@
+"""Rays that are spread evenly over a rectangle: against the general sampler with many, and where nothing hides it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icheat_usd.lighting import build_light_sampler, irradiance
+from icheat_usd.lighting.even import can_look_evenly, look_evenly
+from icheat_usd.lighting.quick import build_shadows, direct_at, prepare_places, shining_points
+from icheat_usd.materials import take_points
+from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
+from tests.lighting.test_quick import LIGHTS, on_floor, tracer_of
+from tests.scenes import Light, Material, Mesh, make_snapshot, quad, quads, rotation, translation
+
+#: Long and upright, with a hand's breadth between it and the floor.
+LONG = Light(LightKind.RECT, (3, 2, 1), (translation(0.0, 0.12, 0.0) @ rotation((0, 1, 0), 90))[:3], (2.0, 0.1))
+SCREEN = quads([[[-0.05, 0, -0.2], [-0.05, 1, -0.2], [-0.05, 1, 2], [-0.05, 0, 2]]])
+
+
+def room(light: Light, *meshes: Mesh) -> SceneSnapshot:
+    return make_snapshot([Mesh(quad(3.0), Material(0.5), path="/floor"), *meshes], lights=[light])
+
+
+def even(snapshot: SceneSnapshot, points: SurfacePoints, seed: int, n_rays: int, before: float = 0.0) -> F32:
+    places = prepare_places(snapshot, points, points.albedo, None)
+    found = np.full((len(points.instance), 3), before, np.float32)
+    shadows, shining = build_shadows(snapshot, tracer_of(snapshot)), shining_points(snapshot, 7, by_form=True)
+    runs = np.arange(places.n_runs, dtype=np.int32)
+    look_evenly(snapshot, shadows, places, shining, seed, n_rays, runs, found)
+    return found
+
+
+def expected(snapshot: SceneSnapshot, points: SurfacePoints, n_rays: int = 4096) -> F32:
+    tracer, sampler = tracer_of(snapshot), build_light_sampler(snapshot)
+    arriving: F32 = irradiance(snapshot, tracer, sampler, points, 3, n_rays)[0]
+    return arriving * points.albedo / np.float32(np.pi)
+
+
+def off(found: F32, exact: F32) -> float:
+    return float(np.sqrt(np.square(found - exact).sum(dtype=np.float64) / np.square(exact).sum(dtype=np.float64)))
+
+
+@pytest.mark.parametrize("name", ["rect", "mirrored"])
+def test_a_rectangle_that_nothing_hides_has_no_noise(name: str) -> None:
+    snapshot = room(LIGHTS[name])
+    points = on_floor(snapshot, 500)
+    np.testing.assert_allclose(even(snapshot, points, 1, 1), expected(snapshot, points), rtol=2e-3)
+
+
+def test_of_a_rectangle_that_is_partly_hidden_nearly_all_noise_is_gone() -> None:
+    """Beside as many looks at points of it, next to it; and nothing is lost in the mean."""
+    snapshot = room(LONG, Mesh(SCREEN, Material(0.5)))
+    points = on_floor(snapshot, 4000)
+    near = np.abs(points.position[:, 0]) < 0.3
+    points = take_points(points, np.flatnonzero(near & (np.abs(points.position[:, 2]) < 0.8)))
+    exact = expected(snapshot, points)
+    places = prepare_places(snapshot, points, points.albedo, None)
+    shadows, shining = build_shadows(snapshot, tracer_of(snapshot)), shining_points(snapshot, 7, by_form=True)
+    look, by_points = np.empty_like(exact), np.zeros_like(exact)
+    for turn in range(4):
+        direct_at(snapshot, shadows, places, 7, False, look, turn, shining=shining)
+        by_points += look / 4
+    evenly = [even(snapshot, points, seed, 4) for seed in range(16)]
+    assert 0.2 < np.mean(exact.sum(axis=1) < 0.9 * expected(room(LONG), points, 64).sum(axis=1)) < 0.9
+    assert off(by_points, exact) > 0.2
+    assert off(evenly[0], exact) < 0.5 * off(by_points, exact)
+    assert off(np.mean(evenly, axis=0), exact) < 0.03
+    assert np.mean(evenly, axis=0).sum() == pytest.approx(exact.sum(), rel=0.01)
+
+
+def test_where_a_surface_cuts_a_rectangle_what_is_above_it_counts() -> None:
+    light = Light(LightKind.RECT, (3, 2, 1), translation(0.0, -0.1, 0.5)[:3], (1.0, 1.0))  # shines to -Z
+    snapshot = room(light)
+    points = on_floor(snapshot, 1000)
+    points = take_points(points, np.flatnonzero(points.position[:, 2] < 0.4))
+    assert off(even(snapshot, points, 1, 4), expected(snapshot, points)) < 0.01
+
+
+def test_places_behind_glass_keep_what_they_have() -> None:
+    panes = [
+        Mesh(quad(0.8), Material(0.0, opacity=opacity, ior=1.5, roughness=0.0), [translation(0.4, 0.3, -0.4)], "/pane")
+        for opacity in (0.0, 1.0)
+    ]
+    glass, opaque = (room(LIGHTS["rect"], pane) for pane in panes)
+    points = on_floor(glass, 2000)
+    kept = even(glass, points, 1, 4, before=-1.0)[:, 0] == -1.0
+    open_share = expected(opaque, points, 256)[:, 0] / expected(room(LIGHTS["rect"]), points, 256)[:, 0]
+    assert kept[open_share < 0.1].all() and not kept[open_share == 1.0].any()
+    assert np.count_nonzero(kept) > 20
+
+
+def test_other_lights_are_not_looked_at_so() -> None:
+    can = {
+        name: can_look_evenly(snapshot, shining_points(snapshot, 7, by_form=True))
+        for name, snapshot in ((name, room(light)) for name, light in LIGHTS.items())
+    }
+    assert [name for name, is_so in can.items() if is_so] == ["rect", "mirrored"]
