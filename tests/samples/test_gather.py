@@ -11,6 +11,7 @@ from icheat_usd.materials import points_on_surface, take_points
 from icheat_usd.samples import GatherSamples, cell_direct, gather_samples, view_samples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
 from icheat_usd.tracing import build_tracer, first_surfaces
+from tests.pipeline import Pipeline
 from tests.scenes import (
     Light,
     Material,
@@ -189,6 +190,23 @@ def test_surfaces_that_the_view_receives_more_from_have_denser_samples() -> None
     gather = gather_of(scene, 2000)
     count = np.bincount(2 * gather.points.instance + gather.points.side, minlength=6)
     assert count[0] > 10 * count[2:4].max()
+
+
+def test_importance_is_what_the_view_receives_if_all_cells_shine_alike() -> None:
+    """By rays of their own: directly, and over one reflection."""
+    pipeline = Pipeline(cornell(), n_gather=512)
+    gather, rows = pipeline.gather, pipeline.transport.lobes[0].rows
+    sides = 2 * gather.points.instance + gather.points.side
+    albedo = gather.points.albedo.max(axis=1)[:, None]
+    received = []
+    for side in np.unique(sides):
+        alone = np.repeat((sides == side)[:, None], 3, axis=1).astype(np.float32)
+        over_one = albedo * pipeline.bounces.rows.matmul(alone)
+        received.append(float(rows.matmul(alone + over_one)[:, 0].mean()))
+    found = [float(gather.importance[sides == side].sum()) for side in np.unique(sides)]
+    assert sum(found) == pytest.approx(1.0, abs=1e-5) and (gather.importance >= 0.0).all()
+    np.testing.assert_allclose(found, np.array(received) / sum(received), atol=0.01)
+    assert max(found) > 0.1
 
 
 def test_leaves_of_one_surface_are_one_range_of_the_tree() -> None:
