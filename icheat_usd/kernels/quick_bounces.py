@@ -24,6 +24,7 @@ from icheat_usd.kernels.simd import (
     plus_size,
     ratios,
     scale_add,
+    scaled,
     spread,
     store,
     store_color,
@@ -138,8 +139,24 @@ def _arrives(entries: np.ndarray, first: int, end: int, mask: int, short: int) -
     return total
 
 
+@kernel
+def _mean_for_others(total: Any, squares: Any, n: int) -> tuple[float, float]:
+    """Share of the mean of `n` noisy values that best stands for others, and how far these are from it.
+
+    With a mean m and a variance v that share is ``k = m^2 / (m^2 + v / n)``, a Wiener filter, and others differ from it
+    by ``v (1 + k / n)`` in the mean square. The square of the sum `total` less the sum of `squares` has the products of
+    all pairs of different values, which are ``m^2`` each in the mean.
+    """
+    all_products, own_products = _total(color_product(total, total)), _total(squares)
+    other_products = max(all_products - own_products, np.float32(0.0)) / np.float32(n - 1)
+    share = min(n * other_products / max(all_products, np.float32(1e-30)), np.float32(1.0))
+    variance = (own_products - all_products / np.float32(n)) / np.float32(n - 1)
+    return share, max(variance, np.float32(0.0)) * (np.float32(1.0) + share / np.float32(n))
+
+
 @parallel_kernel
 def find_missing(
+    clusters: np.ndarray,
     begin: np.ndarray,
     share: np.ndarray,
     indptr: np.ndarray,
@@ -159,10 +176,13 @@ def find_missing(
 ) -> None:
     """What cells lack of their balance: ``direct - light + albedo * (rows @ light)``, at a part of each cluster.
 
-    For other cells the mean of what arrives too little at the part stands: neighbours receive alike.
+    For other cells the mean of what arrives too little at the part stands, as neighbours receive alike: as much of it
+    as is no noise, which would disturb cells that are in balance.
 
     Parameters
     ----------
+    clusters : (n,) int32
+        Those that are looked at; what is set of others is left as it is.
     begin : (n_clusters + 1,) int64; share : (n_gather,) float32
         As for `take_change`.
     indptr : (n_gather + 1,) int64
@@ -177,16 +197,18 @@ def find_missing(
     missing : (n_gather, 4) float32, 16-byte rows
         Set at the part; the fourth column means nothing.
     arriving : (n_clusters, 3) float32
-        Mean of the missing light over that of the albedo, at the part.
+        What arrives too little at cells beside the part.
     leaves : (3, n_clusters) float32
         Mean missing light of all of the cluster.
-    sizes : (n_clusters, 2) float32
-        Sums of the sizes of the missing light, as far as it was found, and of the light at the same cells.
+    sizes : (n_clusters, 3) float32
+        Sums of the sizes of the missing light, as far as it was found, and of the light at the same cells; and the
+        squares of what is probably still missing at all other cells, summed.
     """
     mask = (1 << column_bits) - 1
-    for c in prange(len(begin) - 1):
+    for k in prange(len(clusters)):
+        c = np.int64(clusters[k])
         _find_missing(
-            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo,
+            begin[c], begin[c + 1], c, share, indptr, entries, mask, direct, light, short, albedo,
             mean_albedo, part, parts, missing, arriving, leaves, sizes,
         )  # fmt: skip
 
@@ -200,7 +222,7 @@ def _find_missing(
     """`find_missing` for cluster `c`, the cells from `first` up to `last`."""
     start, target = address_of(short), address_of(missing)
     direct_0, light_0, albedo_0 = address_of(direct), address_of(light), address_of(albedo)
-    mean, white, lacking, here = black(), black(), black(), black()
+    mean, white, lacking, here, squares = black(), black(), black(), black(), black()
     begin, step = _part_of(first, last, part, parts)
     for i in range(begin, last, step):
         if step > 1 and i + step < last:
@@ -213,25 +235,34 @@ def _find_missing(
         store_color(target + 16 * i, lacks)
         lacking, here = plus_size(lacking, lacks), plus_size(here, now)
         mean, white = scale_add(lacks, share[i], mean), scale_add(reflected, share[i], white)
-    share_of_light = ratios(mean, white)
-    store_rgb(address_of(arriving) + 12 * c, share_of_light)
-    sizes[c, 0], sizes[c, 1] = _total(lacking), _total(here)
+        weighted = scaled(lacks, share[i])
+        squares = color_add(weighted, weighted, squares)
+    share_of_light, left = ratios(mean, white), np.float32(0.0)
     if step > 1:
+        n = (last - begin + step - 1) // step
+        of_mean, left = _mean_for_others(mean, squares, n)
+        share_of_light = scaled(share_of_light, of_mean)
+        # shares are about one over the number of cells
+        left *= np.float32((last - first - n) * (last - first) ** 2)
         mean = color_product(load_rgb(address_of(mean_albedo) + 12 * c), share_of_light)
+    store_rgb(address_of(arriving) + 12 * c, share_of_light)
+    sizes[c, 0], sizes[c, 1], sizes[c, 2] = _total(lacking), _total(here), left
     _put_leaf(mean, leaves, c)
 
 
 @parallel_kernel
 def add_missing(
-    begin: np.ndarray, albedo: np.ndarray, missing: np.ndarray, here: np.ndarray, later: np.ndarray, part: int,
-    parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
+    begin: np.ndarray, albedo: np.ndarray, looked_at: np.ndarray, missing: np.ndarray, here: np.ndarray,
+    later: np.ndarray, part: int, parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Add to `light` what was missing and what cells reflect of its later bounces.
 
     Parameters
     ----------
     begin, albedo, missing, part, parts
-        As for `find_missing`; no rows of `missing`: nothing was, and there are later bounces alone.
+        As for `find_missing`.
+    looked_at : (n_clusters,) bool
+        Whether `find_missing` looked at the cluster; at others only later bounces arrive.
     here, later : (n_clusters, 3) float32
         What arrives at other cells than those of the part, and the later bounces that arrive at all.
     light : (n_gather, 4) float32
@@ -239,26 +270,29 @@ def add_missing(
     out : (n_gather, 3) float32, the new light once more; or no rows
     """
     for c in prange(len(begin) - 1):
-        _add_missing(begin[c], begin[c + 1], np.int64(c), albedo, missing, here, later, part, parts, light, short, out)
+        _add_missing(
+            begin[c], begin[c + 1], np.int64(c), albedo, looked_at[c], missing, here, later, part, parts, light, short,
+            out,
+        )  # fmt: skip
 
 
 @kernel
 def _add_missing(
-    first: int, last: int, c: int, albedo: np.ndarray, missing: np.ndarray, here: np.ndarray, later: np.ndarray,
-    part: int, parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
+    first: int, last: int, c: int, albedo: np.ndarray, looked_at: bool, missing: np.ndarray, here: np.ndarray,
+    later: np.ndarray, part: int, parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """`add_missing` for cluster `c`, the cells from `first` up to `last`."""
     albedo_0, light_0, short_0 = address_of(albedo), address_of(light), address_of(short)
     missing_0, out_0 = address_of(missing), address_of(out)
-    has_missing, has_out = len(missing) > 0, len(out) > 0
+    has_out = len(out) > 0
     arrives = load_rgb(address_of(later) + 12 * c)
     elsewhere = arrives
-    if has_missing:
+    if looked_at:
         elsewhere = scale_add(load_rgb(address_of(here) + 12 * c), np.float32(1.0), arrives)
     found, step = _part_of(first, last, part, parts)
     for i in range(first, last):
         reflected, now = load_rgb(albedo_0 + 12 * i), load_color(light_0 + 16 * i)
-        if has_missing and i == found:
+        if looked_at and i == found:
             now = scale_add(load_rgb(missing_0 + 16 * i), np.float32(1.0), now)
             now = color_add(reflected, arrives, now)
             found += step

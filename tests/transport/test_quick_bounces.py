@@ -9,6 +9,7 @@ import numba
 import numpy as np
 import pytest
 
+from icheat_usd.kernels import quick_bounces as kernels
 from icheat_usd.transport import Bounces, SparseRows, solve_bounces
 from icheat_usd.transport import quick_bounces as module
 from icheat_usd.transport.quick_bounces import build_quick_bounces, cluster_begins, lasting_albedo
@@ -97,6 +98,113 @@ def test_bounces_of_a_part_of_the_cells_come_as_close_within_a_round(room: Pipel
         radiance = quick.follow(radiance, direct, direct, part=(part % 4, 4))
     assert errors[0] < 1.5 * error(quick.follow(start, before, direct)) + 0.002
     assert errors[3] < 0.7 * errors[0]
+
+
+def test_noise_at_a_part_of_the_cells_does_not_spread_to_the_others(room: Pipeline) -> None:
+    """What cells of one part lack by chance, others do not lack; what all lack they get from the part."""
+    direct = room.cell_light.direct[0]
+    balance = _balance(room.bounces, direct)
+    quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=32)
+    in_part = np.zeros(len(direct), np.bool_)
+    for first, last in zip(quick.begin[:-1], quick.begin[1:], strict=True):
+        in_part[first : last : 4 if last - first >= 16 else 1] = True
+    rng = np.random.default_rng(3)
+    noise = np.where(in_part, rng.choice([-0.05, 0.05], len(direct)), 0).astype(np.float32)[:, None] * balance
+    off = quick.follow(balance + noise, direct, direct, part=(0, 4))[~in_part] - balance[~in_part]
+    # Given the whole mean of the part, they were off by .17.
+    assert np.sqrt((off**2).mean()) < 0.06 * np.sqrt((noise[in_part] ** 2).mean())
+
+
+def test_a_second_look_goes_to_where_light_is_missing(room: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small bright patch turns dark: a look at a sixteenth of the cells finds half of what is missing."""
+    direct, position = room.cell_light.direct[0], room.gather.points.position
+    before = direct.copy()
+    before[np.argsort(np.linalg.norm(position - position[900], axis=1))[:40]] *= 20
+    exact, start = (_balance(room.bounces, light) for light in (direct, before))
+    quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=32)
+
+    def error() -> float:
+        return float(np.sqrt(((quick.follow(start, before, direct, part=(1, 4)) - exact) ** 2).sum()))
+
+    looked = error()
+    monkeypatch.setattr(module, "_MOST", 0.0)
+    assert looked < 0.6 * error()
+
+
+def test_a_second_look_is_at_the_worst_until_little_is_left(room: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=96)
+    n, left = room.gather.n, np.zeros(quick.n_clusters, np.float32)
+    left[[3, 8, 5, 1]] = 1000, 100, 10, 1
+    for little, worst in ((1112, []), (1110, [3]), (110, [3, 8]), (10.5, [3, 8, 5]), (0.5, [3, 8, 5, 1])):
+        monkeypatch.setattr(module, "_MOST", 1.0)
+        light = np.sqrt(n * little) / module._LEFT
+        assert quick._worst(left, light).tolist() == worst
+        # and no more than can be afforded
+        monkeypatch.setattr(module, "_MOST", np.diff(quick.begin)[[3, 8]].sum() / n)
+        assert quick._worst(left, light).tolist() == worst[:2]
+
+
+def test_missing_light_is_that_of_plain_loops(room: Pipeline) -> None:
+    """Of some clusters, beside loops in double precision; others keep what they have."""
+    quick = build_quick_bounces(room.bounces, room.gather.tree, 16, most_clusters=32)
+    direct = room.cell_light.direct[0]
+    off = np.random.default_rng(5).uniform(0.7, 1.3, direct.shape).astype(np.float32)
+    # Nothing changes, but radiance is wrong: the scratch has what is looked at.
+    light = _balance(room.bounces, direct) * off
+    leaves, sizes = np.empty((3, quick.n_clusters), np.float32), np.empty((quick.n_clusters, 2), np.float32)
+    kernels.take_change(quick.begin, quick.share, light, direct, direct, quick.scratch[0], quick.short, leaves, sizes)
+    clusters, part, parts = np.array([5, 2, 11], np.int32), 1, 4
+    missing = quick.scratch[1]
+    found = np.full((quick.n_clusters, 3), -7, np.float32)
+    leaves, sizes = np.full((3, quick.n_clusters), -7, np.float32), np.full((quick.n_clusters, 3), -7, np.float32)
+    kernels.find_missing(
+        clusters, quick.begin, quick.share, quick.indptr, quick.entries, quick.column_bits, direct, quick.scratch[0],
+        quick.short, quick.albedo, quick.mean_albedo, part, parts, missing, found, leaves, sizes,
+    )  # fmt: skip
+    lacks = direct + quick.albedo * room.bounces.few.matmul(light) - light
+    for c in clusters:
+        first, last = quick.begin[c], quick.begin[c + 1]
+        cells = np.arange(first, last) if last - first < 16 else np.arange(first + part, last, parts)
+        n, share = len(cells), quick.share[cells, None].astype(np.float64)
+        weighted = lacks[cells] * share
+        pairs = sum((weighted[i] * weighted[j]).sum() for i in range(n) for j in range(n) if i != j) / (n * (n - 1))
+        true = np.clip(pairs / (weighted.mean(axis=0) ** 2).sum(), 0, 1)
+        arrives = true * weighted.sum(axis=0) / (share * quick.albedo[cells]).sum(axis=0)
+        variance = weighted.var(axis=0, ddof=1).sum() * (1 + true / n)
+        left = variance * (last - first) ** 2 * (last - first - n)
+        np.testing.assert_allclose(missing[cells, :3], lacks[cells], rtol=0.02, atol=0.02 * np.abs(lacks).mean())
+        np.testing.assert_allclose(found[c], arrives, rtol=0.1)
+        np.testing.assert_allclose(leaves[:, c], arrives * quick.mean_albedo[c], rtol=0.1)
+        np.testing.assert_allclose(sizes[c], [np.abs(lacks[cells]).sum(), light[cells].sum(), left], rtol=0.03)
+    others = np.setdiff1d(np.arange(quick.n_clusters), clusters)
+    assert (found[others] == -7).all() and (leaves[:, others] == -7).all() and (sizes[others] == -7).all()
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.3, 3.0])
+def test_of_a_noisy_mean_as_much_is_taken_as_leaves_least(mean: float) -> None:
+    """Of many clusters what is still missing is as much as was said, and not more than with all or none of the mean."""
+    n_clusters, size, parts = 600, 64, 8
+    n, begin = n_clusters * size, np.arange(0, n_clusters * size + 1, size)
+    rng = np.random.default_rng(7)
+    direct = rng.normal(mean, 1, (n, 3)).astype(np.float32)
+    light, missing, short = np.zeros((n, 4), np.float32), np.zeros((n, 4), np.float32), np.zeros(n, np.uint64)
+    found, leaves = np.zeros((n_clusters, 3), np.float32), np.zeros((3, n_clusters), np.float32)
+    sizes = np.zeros((n_clusters, 3), np.float32)
+    white = np.ones((n, 3), np.float32)
+    kernels.find_missing(
+        np.arange(n_clusters, dtype=np.int32), begin, np.full(n, 1 / size, np.float32), np.zeros(n + 1, np.int64),
+        np.zeros(0, np.uint32), 16, direct, light, short, white, white[:n_clusters], 2, parts, missing, found, leaves,
+        sizes,
+    )  # fmt: skip
+    cells = direct.reshape(n_clusters, size // parts, parts, 3)
+    others = np.delete(cells, 2, axis=2)
+    means = cells[:, :, 2].mean(axis=1)
+
+    def left(taken: np.ndarray) -> float:
+        return float(((others - taken[:, None, None]) ** 2).sum())
+
+    assert sizes[:, 2].sum() == pytest.approx(left(found), rel=0.03)
+    assert left(found) < 1.03 * min(left(means), left(0 * means))
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.3, 0.8, 0.99, 1.0])
