@@ -156,7 +156,6 @@ def _mean_for_others(total: Any, squares: Any, n: int) -> tuple[float, float]:
 
 @parallel_kernel
 def find_missing(
-    clusters: np.ndarray,
     begin: np.ndarray,
     share: np.ndarray,
     indptr: np.ndarray,
@@ -181,8 +180,6 @@ def find_missing(
 
     Parameters
     ----------
-    clusters : (n,) int32
-        Those that are looked at; what is set of others is left as it is.
     begin : (n_clusters + 1,) int64; share : (n_gather,) float32
         As for `take_change`.
     indptr : (n_gather + 1,) int64
@@ -205,10 +202,9 @@ def find_missing(
         squares of what is probably still missing at all other cells, summed.
     """
     mask = (1 << column_bits) - 1
-    for k in prange(len(clusters)):
-        c = np.int64(clusters[k])
+    for c in prange(len(begin) - 1):
         _find_missing(
-            begin[c], begin[c + 1], c, share, indptr, entries, mask, direct, light, short, albedo,
+            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo,
             mean_albedo, part, parts, missing, arriving, leaves, sizes,
         )  # fmt: skip
 
@@ -252,17 +248,15 @@ def _find_missing(
 
 @parallel_kernel
 def add_missing(
-    begin: np.ndarray, albedo: np.ndarray, looked_at: np.ndarray, missing: np.ndarray, here: np.ndarray,
-    later: np.ndarray, part: int, parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
+    begin: np.ndarray, albedo: np.ndarray, missing: np.ndarray, here: np.ndarray, later: np.ndarray, part: int,
+    parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Add to `light` what was missing and what cells reflect of its later bounces.
 
     Parameters
     ----------
     begin, albedo, missing, part, parts
-        As for `find_missing`.
-    looked_at : (n_clusters,) bool
-        Whether `find_missing` looked at the cluster; at others only later bounces arrive.
+        As for `find_missing`; no rows of `missing`: nothing was, and there are later bounces alone.
     here, later : (n_clusters, 3) float32
         What arrives at other cells than those of the part, and the later bounces that arrive at all.
     light : (n_gather, 4) float32
@@ -270,29 +264,26 @@ def add_missing(
     out : (n_gather, 3) float32, the new light once more; or no rows
     """
     for c in prange(len(begin) - 1):
-        _add_missing(
-            begin[c], begin[c + 1], np.int64(c), albedo, looked_at[c], missing, here, later, part, parts, light, short,
-            out,
-        )  # fmt: skip
+        _add_missing(begin[c], begin[c + 1], np.int64(c), albedo, missing, here, later, part, parts, light, short, out)
 
 
 @kernel
 def _add_missing(
-    first: int, last: int, c: int, albedo: np.ndarray, looked_at: bool, missing: np.ndarray, here: np.ndarray,
-    later: np.ndarray, part: int, parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
+    first: int, last: int, c: int, albedo: np.ndarray, missing: np.ndarray, here: np.ndarray, later: np.ndarray,
+    part: int, parts: int, light: np.ndarray, short: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """`add_missing` for cluster `c`, the cells from `first` up to `last`."""
     albedo_0, light_0, short_0 = address_of(albedo), address_of(light), address_of(short)
     missing_0, out_0 = address_of(missing), address_of(out)
-    has_out = len(out) > 0
+    has_missing, has_out = len(missing) > 0, len(out) > 0
     arrives = load_rgb(address_of(later) + 12 * c)
     elsewhere = arrives
-    if looked_at:
+    if has_missing:
         elsewhere = scale_add(load_rgb(address_of(here) + 12 * c), np.float32(1.0), arrives)
     found, step = _part_of(first, last, part, parts)
     for i in range(first, last):
         reflected, now = load_rgb(albedo_0 + 12 * i), load_color(light_0 + 16 * i)
-        if looked_at and i == found:
+        if has_missing and i == found:
             now = scale_add(load_rgb(missing_0 + 16 * i), np.float32(1.0), now)
             now = color_add(reflected, arrives, now)
             found += step
@@ -302,6 +293,35 @@ def _add_missing(
         store_short(short_0 + 8 * i, now)
         if has_out:
             store_rgb(out_0 + 12 * i, now)
+
+
+@parallel_kernel
+def balance_clusters(
+    clusters: np.ndarray, begin: np.ndarray, indptr: np.ndarray, entries: np.ndarray, column_bits: int,
+    direct: np.ndarray, short: np.ndarray, albedo: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Give all cells of some clusters the light of their balance: ``direct + albedo * (rows @ light)``.
+
+    `clusters` (n,) int32; all else is as `find_missing` has it. `short` is that light, and `out` (n_gather, 3) float32
+    another array.
+    """
+    mask = (1 << column_bits) - 1
+    for k in prange(len(clusters)):
+        first, last = begin[clusters[k]], begin[clusters[k] + 1]
+        _balance_cells(first, last, indptr, entries, mask, direct, short, albedo, out)
+
+
+@kernel
+def _balance_cells(
+    first: int, last: int, indptr: np.ndarray, entries: np.ndarray, mask: int, direct: np.ndarray, short: np.ndarray,
+    albedo: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """`balance_clusters` for the cells from `first` up to `last`."""
+    direct_0, albedo_0, out_0 = address_of(direct), address_of(albedo), address_of(out)
+    for i in range(first, last):
+        arrives = _arrives(entries, indptr[i], indptr[i + 1], mask, address_of(short))
+        sent = color_add(load_rgb(albedo_0 + 12 * i), arrives, load_rgb(direct_0 + 12 * i))
+        store_rgb(out_0 + 12 * i, sent)
 
 
 @parallel_kernel

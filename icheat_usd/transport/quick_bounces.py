@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from icheat_usd.kernels import quick_bounces as kernels
 from icheat_usd.kernels.workers import take_back
 from icheat_usd.samples import ClusterTree
-from icheat_usd.scene import F32, I32, I64, Bool
+from icheat_usd.scene import F32, I32, I64
 from icheat_usd.transport.bounces import Bounces
 from icheat_usd.transport.sparse import SparseRows
 
@@ -84,7 +84,7 @@ class QuickBounces:
             self._step(direct, _ALL, 1.0, out)
             return out
         # Nothing grows in so few steps.
-        self._add_change(leaves, 1.0)
+        self._add(leaves, None, _ALL, 1.0, none)
         for _ in range(_FIRST_STEPS):
             self._step(direct, _ALL, 1.0, out)
         return out
@@ -108,12 +108,14 @@ class QuickBounces:
         leaves, (changed, all_of_it) = self._take_change(radiance, before, direct)
         if changed > all_of_it:
             return self.solve(direct, out)
-        self._add_change(leaves, self.sent_on)
+        self._add(leaves, None, _ALL, self.sent_on, np.empty((0, 3), np.float32))
         lacking, light, left = self._step(direct, part, self.sent_on, out).T
         if lacking.sum() > _FAR * light.sum():
             self._step(direct, _ALL, self.sent_on, out)
         elif len(worst := self._worst(left, float(light.sum()) * part[1])):
-            self._step(direct, _ALL, self.sent_on, out, worst)
+            rows = self.indptr, self.entries, self.column_bits
+            take_back()
+            kernels.balance_clusters(worst, self.begin, *rows, direct, self.short, self.albedo, out)
         return out
 
     def _worst(self, left: F32, light: float) -> I32:
@@ -133,16 +135,14 @@ class QuickBounces:
         )
         return leaves, sizes.sum(axis=0)
 
-    def _step(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32, clusters: I32 | None = None) -> F32:
-        """Add what is missing, at some clusters or all; (n_clusters, 3) `sizes` of `kernels.find_missing`."""
-        clusters = np.arange(self.n_clusters, dtype=np.int32) if clusters is None else clusters
+    def _step(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32) -> F32:
+        """Add what is missing; (n_clusters, 3) `sizes` of `kernels.find_missing`, of before."""
         light, missing = self.scratch
-        leaves, sizes = np.zeros((3, self.n_clusters), np.float32), np.zeros((self.n_clusters, 3), np.float32)
-        arriving = np.zeros((self.n_clusters, 3), np.float32)
+        leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 3), np.float32)
+        arriving = np.empty((self.n_clusters, 3), np.float32)
         rows = self.indptr, self.entries, self.column_bits
         take_back()
         kernels.find_missing(
-            clusters,
             self.begin,
             self.share,
             *rows,
@@ -157,23 +157,17 @@ class QuickBounces:
             leaves,
             sizes,
         )
-        looked_at = np.zeros(self.n_clusters, np.bool_)
-        looked_at[clusters] = True
-        self._add(leaves, arriving, looked_at, part, sent_on, out)
+        self._add(leaves, arriving, part, sent_on, out)
         return sizes
 
-    def _add_change(self, leaves: F32, sent_on: float) -> None:
-        """Add the later bounces of a change that leaves clusters, before any row is looked at."""
-        here, out = np.empty((self.n_clusters, 3), np.float32), np.empty((0, 3), np.float32)
-        self._add(leaves, here, np.zeros(self.n_clusters, np.bool_), _ALL, sent_on, out)
-
-    def _add(self, leaves: F32, here: F32, looked_at: Bool, part: tuple[int, int], sent_on: float, out: F32) -> None:
+    def _add(self, leaves: F32, here: F32 | None, part: tuple[int, int], sent_on: float, out: F32) -> None:
         """Add the later bounces of light that leaves clusters; and what is missing, which arrives as `here` says."""
         later = np.empty((self.n_clusters, 3), np.float32)
         take_back()
         kernels.reach_clusters(self.blocks, leaves * np.float32(sent_on), later)
         light, missing = self.scratch
-        kernels.add_missing(self.begin, self.albedo, looked_at, missing, here, later, *part, light, self.short, out)
+        here, missing = (later, missing[:0]) if here is None else (here, missing)
+        kernels.add_missing(self.begin, self.albedo, missing, here, later, *part, light, self.short, out)
 
     @property
     def n_clusters(self) -> int:
