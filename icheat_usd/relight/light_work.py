@@ -38,6 +38,7 @@ from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside
 from icheat_usd.relight.grain import Grain, order_of_tiles
+from icheat_usd.relight.known_bounces import KnownBounces
 from icheat_usd.relight.known_noise import KnownNoise
 from icheat_usd.relight.view_light import ROUNDS, ROUNDS_AT_GRAIN, look_in_rounds
 from icheat_usd.samples import GatherSamples, ViewSamples
@@ -296,22 +297,37 @@ class Following:
     """What is kept of a light from one first look to the next, while it moves."""
 
     def __init__(self, around: Surroundings) -> None:
-        self.n = 0  #: first looks so far
+        self._around = around
+        self._n = 0  # first looks so far
         self._noise: tuple[KnownNoise, KnownNoise] | None = None  # of first looks at cells and at view samples
         self.cells = None if around.cells is None else LastLook(around.cells)
         self.view = None if around.tiles is None else LastLook(around.tiles)
         self.patches = None if around.patches is None else CloserLook(around.patches, around.gather, around.beside)
+        self._bounces: KnownBounces | None = None
 
     def next_part(self) -> tuple[int, int]:
         """Of the cells, whose bounces are looked at this time; all of them at first."""
-        self.n += 1
-        return (0, 1) if self.n == 1 else (self.n % PARTS, PARTS)
+        self._n += 1
+        return (0, 1) if self._n == 1 else (self._n % PARTS, PARTS)
 
-    def know(self, around: Surroundings, alone: SceneSnapshot, look: tuple[F32, F32], known: tuple[F32, F32]) -> None:
+    def bounce(self, direct: F32, radiance: F32, before: F32 | None, part: tuple[int, int] = (0, 1)) -> None:
+        """`Surroundings.bounce`, less known errors."""
+        if self._bounces is not None:
+            before, direct = self._bounces.before, self._bounces.take_from(direct, radiance)
+        self._around.bounce(direct, radiance, before, part)
+
+    def know_bounces(self, direct: F32, radiance: F32) -> None:
+        """Take from later bounces what few rays get wrong of the light of all bounces, which is known now."""
+        quick = self._around.quick_bounces
+        off = None if quick is None else quick.off_balance(radiance, direct)
+        self._bounces = None if off is None else KnownBounces(off, radiance, direct)
+
+    def know(self, alone: SceneSnapshot, look: tuple[F32, F32], known: tuple[F32, F32]) -> None:
         """Take from later first looks what is noise in one, at cells and at view samples, by what is known there.
 
         `alone` is the light as it was then.
         """
+        around = self._around
         assert around.tiles is not None
         # Smoothed, a sun's patch would leave ghosts of its borders where these were.
         smooths = int(alone.lights.kind[0]) != LightKind.DISTANT
@@ -364,7 +380,9 @@ class MovingLight:
         """Whether enough rounds were made for `show` to know noise by what they found."""
         return self._step >= 2 * min(_KNOWN_ROUNDS, self._rounds)
 
-    def show(self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None) -> None:
+    def show(
+        self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None, is_solved: bool = False
+    ) -> None:
         """First look: a shadow ray per cell, more where that leaves noise, and one per view sample at shadows' edges.
 
         Near the look before, a part of these rays is enough.
@@ -374,18 +392,22 @@ class MovingLight:
         known : SceneSnapshot, optional
             The light as it was when many rays found `self.direct` and `view_direct`: noise of a look there is taken
             from looks from now on.
+        is_solved : bool
+            Whether `radiance` is that of all bounces of `self.direct`: errors of a few are taken from now on, too.
         """
         around = self._around
         self.following = last = self.following or Following(around)
         if known is not None and self.direct is not None:
             look = np.empty_like(self.direct), np.empty_like(view_direct)
             MovingLight(around, known, self._seed, self._rounds, None)._look(last, *look)
-            last.know(around, known, look, (self.direct, view_direct))
+            last.know(known, look, (self.direct, view_direct))
+        if is_solved and self.direct is not None:
+            last.know_bounces(self.direct, radiance)
         direct = np.empty((around.gather.n, 3), np.float32)
 
         def bounce() -> None:
             last.clean_cells(direct)
-            around.bounce(direct, radiance, self.direct, last.next_part())
+            last.bounce(direct, radiance, self.direct, last.next_part())
 
         self._look(last, direct, view_direct, bounce)
         last.clean_view(view_direct)
@@ -435,7 +457,8 @@ class MovingLight:
         else:
             self._cells += around.cell_means(self._round(around.patches, turn))
             direct = self._cells * share
-            around.bounce(direct, radiance, self.direct)
+            bounce = around.bounce if self.following is None else self.following.bounce
+            bounce(direct, radiance, self.direct)
             self.direct = direct
         return True
 
@@ -537,10 +560,12 @@ class AnyLight:
         self._view = np.empty((1, 0, 3), np.float32)  # from the first look at it on
         self.following: Following | None = None  #: set from before to spare work
 
-    def show(self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None) -> None:
+    def show(
+        self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None, is_solved: bool = False
+    ) -> None:
         """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample.
 
-        `known` is that of `MovingLight.show`, for domes.
+        `known` and `is_solved` are those of `MovingLight.show`, for domes.
         """
         around = self._around
         if around.shadows is not None and self._alone.lights.kind[0] == LightKind.DOME:
@@ -549,11 +574,13 @@ class AnyLight:
             if known is not None and self.direct is not None:
                 look = np.empty_like(self.direct), np.empty_like(view_direct)
                 self._look_at_sky(known, *look)
-                last.know(around, known, look, (self.direct, view_direct))
+                last.know(known, look, (self.direct, view_direct))
+            if is_solved and self.direct is not None:
+                last.know_bounces(self.direct, radiance)
             direct = np.empty((around.gather.n, 3), np.float32)
             self._look_at_sky(self._alone, direct, view_direct)
             last.clean_cells(direct)
-            around.bounce(direct, radiance, self.direct, last.next_part())
+            last.bounce(direct, radiance, self.direct, last.next_part())
             self.direct = direct
             last.clean_view(view_direct)
             return

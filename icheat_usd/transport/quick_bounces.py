@@ -118,6 +118,18 @@ class QuickBounces:
             kernels.balance_clusters(worst, self.begin, *rows, direct, self.short, self.albedo, out)
         return out
 
+    def off_balance(self, radiance: F32, direct: F32) -> F32 | None:
+        """What the few rays of the rows would add to the light of all bounces of direct light, all (n_gather, 3).
+
+        Where `follow` is given so much less direct light, it stays at that light. None where there are too few bounces
+        for a balance.
+        """
+        if not self.lasting:
+            return None
+        self._take_change(radiance, direct, direct)
+        self._find_missing(direct, _ALL)
+        return np.ascontiguousarray(self.scratch[1, :, :3])
+
     def _worst(self, left: F32, light: float) -> I32:
         """Clusters where most is still missing, worst first: squares of it (n_clusters,), beside all cells' light."""
         n, order = len(self.albedo), np.argsort(-left, kind="stable")
@@ -137,6 +149,12 @@ class QuickBounces:
 
     def _step(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32) -> F32:
         """Add what is missing; (n_clusters, 3) `sizes` of `kernels.find_missing`, of before."""
+        leaves, arriving, sizes = self._find_missing(direct, part)
+        self._add(leaves, arriving, part, sent_on, out)
+        return sizes
+
+    def _find_missing(self, direct: F32, part: tuple[int, int]) -> tuple[F32, F32, F32]:
+        """Put what is missing into the scratch; `leaves`, `arriving` and `sizes` of `kernels.find_missing`."""
         light, missing = self.scratch
         leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 3), np.float32)
         arriving = np.empty((self.n_clusters, 3), np.float32)
@@ -157,8 +175,7 @@ class QuickBounces:
             leaves,
             sizes,
         )
-        self._add(leaves, arriving, part, sent_on, out)
-        return sizes
+        return leaves, arriving, sizes
 
     def _add(self, leaves: F32, here: F32 | None, part: tuple[int, int], sent_on: float, out: F32) -> None:
         """Add the later bounces of light that leaves clusters; and what is missing, which arrives as `here` says."""

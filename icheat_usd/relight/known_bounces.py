@@ -1,0 +1,37 @@
+"""What the few rays of quick bounces get wrong of a light at rest, taken from its bounces while it moves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icheat_usd.scene import F32
+
+#: One of so many cells tells how much of the light at rest is in another.
+_ASKED = 16
+
+
+class KnownBounces:
+    """Errors of bounce rows in the light of all bounces, as if they were direct light: a control variate nearby.
+
+    The rows' rays are the same from one look to the next. Of noise that is independent from ray to ray, as much is in
+    other light as that of the rest is in it by least squares, and what is different has noise of its own.
+
+    Parameters
+    ----------
+    error : (n_gather, 3)
+        What few rays would add to `radiance`, of `QuickBounces.off_balance`.
+    radiance, direct : (n_gather, 3)
+        Light of all bounces of that direct light.
+    """
+
+    def __init__(self, error: F32, radiance: F32, direct: F32) -> None:
+        self._error, self._light = error, radiance[::_ASKED].astype(np.float64)
+        self._square = np.square(self._light).sum(axis=0)
+        self.before: F32 = direct - error  #: what `take_from` gave last, at first for the light at rest
+
+    def take_from(self, direct: F32, radiance: F32) -> F32:
+        """Direct light less the errors of its bounces, (n_gather, 3); by `radiance` of the look before."""
+        product = (self._light * radiance[::_ASKED]).sum(axis=0)
+        share = np.divide(product, self._square, out=np.zeros(3), where=self._square > 0)
+        self.before = direct - self._error * share.astype(np.float32)
+        return self.before

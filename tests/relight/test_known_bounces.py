@@ -1,0 +1,96 @@
+"""Bounces of lights that are moved from rest: what few rays get wrong of them there is not wrong again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icheat_usd.relight.known_bounces import KnownBounces
+from icheat_usd.relight.light_work import Following
+from icheat_usd.relight.lights import LiveLights
+from icheat_usd.scene import F32
+from icheat_usd.transport import Bounces, SparseRows, solve_bounces
+from icheat_usd.transport.quick_bounces import build_quick_bounces
+from tests.pipeline import Pipeline
+from tests.relight.test_known_noise import Kind, dome, rect, room
+from tests.relight.test_live_lights import settle
+
+
+@pytest.fixture(scope="module")
+def scene() -> Pipeline:
+    return Pipeline(room(rect(0.0)), n_gather=1500, bounce_rays=512)
+
+
+def noisy(bounces: Bounces) -> Bounces:
+    """With a few rays of each row: every eighth entry, as often."""
+    rows, rng = bounces.rows, np.random.default_rng(1)
+    kept = rng.random(rows.n_entries) < 1 / 8
+    before = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
+    few = SparseRows(before[rows.indptr], rows.indices[kept], rows.weights[kept] * np.float32(8), rows.n_columns)
+    return Bounces(rows, bounces.albedo, few)
+
+
+def rms(values: F32) -> float:
+    return float(np.sqrt((values.astype(np.float64) ** 2).mean()))
+
+
+def test_light_of_all_bounces_stays_where_errors_of_few_rays_are_taken(scene: Pipeline) -> None:
+    bounces, direct = noisy(scene.bounces), scene.cell_light.direct[0]
+    exact = solve_bounces(bounces, direct[None], 16)[0]
+    quick = build_quick_bounces(bounces, scene.gather.tree, 16)
+    off = quick.off_balance(exact, direct)
+    assert off is not None
+    np.testing.assert_allclose(
+        off, direct + quick.albedo * bounces.few.matmul(exact) - exact, rtol=0.02, atol=0.01 * rms(exact)
+    )
+    taken, plain = exact.copy(), exact.copy()
+    for part in range(8):
+        quick.follow(taken, direct - off, direct - off, taken, (part, 8))
+        quick.follow(plain, direct, direct, plain, (part, 8))
+    assert rms(taken - exact) < 2e-3 * rms(exact) < 0.02 * rms(exact) < rms(plain - exact)
+    assert build_quick_bounces(bounces, scene.gather.tree, 4).off_balance(exact, direct) is None
+
+
+@pytest.mark.parametrize("common", [0.0, 0.4, 1.0, 1.7])
+def test_as_much_of_an_error_is_taken_as_two_lights_have_in_common(common: float) -> None:
+    """Rows whose noise is independent: errors that are left are the least that a share of the known ones can leave."""
+    n, rng = 640, np.random.default_rng(2)
+    rows = rng.standard_normal((n, n)) / np.sqrt(n)
+    rest = rng.random((n, 3))
+    light = common * rest + 0.3 * rng.standard_normal((n, 3))
+    known = KnownBounces((rows @ rest).astype(np.float32), rest.astype(np.float32), np.zeros((n, 3), np.float32))
+    np.testing.assert_allclose(known.before, -(rows @ rest), rtol=1e-5)
+    taken = -known.take_from(np.zeros((n, 3), np.float32), light.astype(np.float32))
+    assert known.before is not None and (known.before == -taken).all()
+    left = [rms(rows @ light - share * (rows @ rest)) for share in np.linspace(0, 2, 41)]
+    assert rms(rows @ light - taken) < 1.1 * min(left)
+
+
+def test_nothing_is_taken_of_a_light_that_was_dark() -> None:
+    dark = np.zeros((32, 3), np.float32)
+    direct = np.ones((32, 3), np.float32)
+    np.testing.assert_array_equal(KnownBounces(dark, dark, dark).take_from(direct, direct), direct)
+
+
+@pytest.mark.parametrize("light", [rect, dome])
+def test_bounces_of_a_light_moved_from_rest_are_closer_to_all_bounces(
+    scene: Pipeline, light: Kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bounces = noisy(scene.bounces)
+
+    def error() -> float:
+        """After ten frames of a short way."""
+        step = 0.02 if light is rect else 2.0
+        parts = scene.tracer, scene.view, scene.gather, bounces
+        lights = LiveLights(room(light(0.0)), *parts, n_bounces=16, light_samples=4, seed=3)
+        settle(lights)
+        for frame in range(1, 11):
+            lights.change(0, to_world=light(step * frame).to_world)
+        direct = lights._lights[0].direct
+        assert direct is not None
+        exact = solve_bounces(bounces, direct[None], 16)[0]
+        return rms(lights.radiance[0] - exact) / rms(exact)
+
+    known = error()
+    monkeypatch.setattr(Following, "know_bounces", lambda *_: None)
+    assert known < 0.6 * error()
