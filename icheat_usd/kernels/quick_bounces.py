@@ -197,9 +197,9 @@ def find_missing(
         What arrives too little at cells beside the part.
     leaves : (3, n_clusters) float32
         Mean missing light of all of the cluster.
-    sizes : (n_clusters, 3) float32
-        Sums of the sizes of the missing light, as far as it was found, and of the light at the same cells; and the
-        squares of what is probably still missing at all other cells, summed.
+    sizes : (n_clusters, 4) float32
+        Sums of the sizes of the missing light, as far as it was found, and of the light at the same cells; the squares
+        of what is probably still missing at all other cells, summed; and the light of all cells, by these.
     """
     mask = (1 << column_bits) - 1
     for c in prange(len(begin) - 1):
@@ -233,16 +233,18 @@ def _find_missing(
         mean, white = scale_add(lacks, share[i], mean), scale_add(reflected, share[i], white)
         weighted = scaled(lacks, share[i])
         squares = color_add(weighted, weighted, squares)
+    n = (last - begin + step - 1) // step
     share_of_light, left = ratios(mean, white), np.float32(0.0)
     if step > 1:
-        n = (last - begin + step - 1) // step
         of_mean, left = _mean_for_others(mean, squares, n)
         share_of_light = scaled(share_of_light, of_mean)
         # shares are about one over the number of cells
         left *= np.float32((last - first - n) * (last - first) ** 2)
         mean = color_product(load_rgb(address_of(mean_albedo) + 12 * c), share_of_light)
     store_rgb(address_of(arriving) + 12 * c, share_of_light)
-    sizes[c, 0], sizes[c, 1], sizes[c, 2] = _total(lacking), _total(here), left
+    light_here = _total(here)
+    sizes[c, 0], sizes[c, 1], sizes[c, 2] = _total(lacking), light_here, left
+    sizes[c, 3] = light_here * np.float32((last - first) / n)
     _put_leaf(mean, leaves, c)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icheat_usd.scene import F32
+from icheat_usd.scene import F32, F64
 
 #: One of so many cells tells how much of the light at rest is in another.
 _ASKED = 16
@@ -27,11 +27,21 @@ class KnownBounces:
     def __init__(self, error: F32, radiance: F32, direct: F32) -> None:
         self._error, self._light = error, radiance[::_ASKED].astype(np.float64)
         self._square = np.square(self._light).sum(axis=0)
+        self._direct = direct[::_ASKED].astype(np.float64)  # of the look before
         self.before: F32 = direct - error  #: what `take_from` gave last, at first for the light at rest
 
     def take_from(self, direct: F32, radiance: F32) -> F32:
         """Direct light less the errors of its bounces, (n_gather, 3); by `radiance` of the look before."""
-        product = (self._light * radiance[::_ASKED]).sum(axis=0)
-        share = np.divide(product, self._square, out=np.zeros(3), where=self._square > 0)
+        share = _ratio((self._light * radiance[::_ASKED]).sum(axis=0), self._square)
+        before, self._direct = self._direct, direct[::_ASKED].astype(np.float64)
+        # Where a light is dimmed or jumps, the look before says too much.
+        share *= np.minimum(_ratio(self._direct.sum(axis=0), before.sum(axis=0)), 1)
+        if np.abs(self._direct - before).sum() > self._direct.sum():
+            share[:] = 0
         self.before = direct - self._error * share.astype(np.float32)
         return self.before
+
+
+def _ratio(a: F64, b: F64) -> F64:
+    """Channel by channel, 0 over 0."""
+    return np.divide(a, b, out=np.zeros(3), where=b > 0)

@@ -278,7 +278,7 @@ class ExactBounces:
 class KnownLight:
     """A light at rest whose bounces alone are solved anew."""
 
-    is_known = True
+    is_known = is_solved = True
 
     def __init__(self, around: Surroundings, direct: F32) -> None:
         self._around, self.direct = around, direct
@@ -371,6 +371,7 @@ class MovingLight:
         self._sampler: LightSampler | None = None
         self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
+        self.is_solved = False  #: whether that radiance has all bounces
         self.following: Following | None = None  #: set from before to spare work
         self._cells = np.empty((0, 3), np.float32)  # from the first step on
         self._grain: Grain | None = None  # the same
@@ -449,7 +450,7 @@ class MovingLight:
             self._exact = self._exact or ExactBounces(around, direct)
             if self._exact.step(radiance):
                 return True
-            self.direct = direct
+            self.direct, self.is_solved = direct, True
             return self._light_grain(view_direct) or self._light_exposed(view_direct)
         share = np.float32(1.0 / (turn + 1))
         if at_view:
@@ -556,6 +557,7 @@ class AnyLight:
         self.is_known = False  #: whether enough rounds were made for `show` to know noise by what they found
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
+        self.is_solved = False  #: whether that radiance has all bounces
         self._cells = np.empty((0, 3), np.float32)  # from the first step on
         self._view = np.empty((1, 0, 3), np.float32)  # from the first look at it on
         self.following: Following | None = None  #: set from before to spare work
@@ -614,7 +616,7 @@ class AnyLight:
         self._exact = self._exact or ExactBounces(around, self._cells)
         if self._exact.step(radiance):
             return True
-        self.direct = self._cells
+        self.direct, self.is_solved = self._cells, True
         if not around.view.n:
             return False
         if len(self._samplers) < 2:

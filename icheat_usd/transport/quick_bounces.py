@@ -109,10 +109,10 @@ class QuickBounces:
         if changed > all_of_it:
             return self.solve(direct, out)
         self._add(leaves, None, _ALL, self.sent_on, np.empty((0, 3), np.float32))
-        lacking, light, left = self._step(direct, part, self.sent_on, out).T
+        lacking, light, left, of_all = self._step(direct, part, self.sent_on, out).T
         if lacking.sum() > _FAR * light.sum():
             self._step(direct, _ALL, self.sent_on, out)
-        elif len(worst := self._worst(left, float(light.sum()) * part[1])):
+        elif len(worst := self._worst(left, float(of_all.sum()))):
             rows = self.indptr, self.entries, self.column_bits
             take_back()
             kernels.balance_clusters(worst, self.begin, *rows, direct, self.short, self.albedo, out)
@@ -128,7 +128,7 @@ class QuickBounces:
             return None
         self._take_change(radiance, direct, direct)
         self._find_missing(direct, _ALL)
-        return np.ascontiguousarray(self.scratch[1, :, :3])
+        return self.scratch[1, :, :3].copy()
 
     def _worst(self, left: F32, light: float) -> I32:
         """Clusters where most is still missing, worst first: squares of it (n_clusters,), beside all cells' light."""
@@ -148,7 +148,7 @@ class QuickBounces:
         return leaves, sizes.sum(axis=0)
 
     def _step(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32) -> F32:
-        """Add what is missing; (n_clusters, 3) `sizes` of `kernels.find_missing`, of before."""
+        """Add what is missing; (n_clusters, 4) `sizes` of `kernels.find_missing`, of before."""
         leaves, arriving, sizes = self._find_missing(direct, part)
         self._add(leaves, arriving, part, sent_on, out)
         return sizes
@@ -156,7 +156,7 @@ class QuickBounces:
     def _find_missing(self, direct: F32, part: tuple[int, int]) -> tuple[F32, F32, F32]:
         """Put what is missing into the scratch; `leaves`, `arriving` and `sizes` of `kernels.find_missing`."""
         light, missing = self.scratch
-        leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 3), np.float32)
+        leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 4), np.float32)
         arriving = np.empty((self.n_clusters, 3), np.float32)
         rows = self.indptr, self.entries, self.column_bits
         take_back()

@@ -155,7 +155,7 @@ def test_missing_light_is_that_of_plain_loops(room: Pipeline) -> None:
     kernels.take_change(quick.begin, quick.share, light, direct, direct, quick.scratch[0], quick.short, leaves, sizes)
     part, parts = 1, 4
     missing = quick.scratch[1]
-    found, sizes = np.empty((quick.n_clusters, 3), np.float32), np.empty((quick.n_clusters, 3), np.float32)
+    found, sizes = np.empty((quick.n_clusters, 3), np.float32), np.empty((quick.n_clusters, 4), np.float32)
     kernels.find_missing(
         quick.begin, quick.share, quick.indptr, quick.entries, quick.column_bits, direct, quick.scratch[0],
         quick.short, quick.albedo, quick.mean_albedo, part, parts, missing, found, leaves, sizes,
@@ -174,7 +174,13 @@ def test_missing_light_is_that_of_plain_loops(room: Pipeline) -> None:
         np.testing.assert_allclose(missing[cells, :3], lacks[cells], rtol=0.02, atol=0.02 * np.abs(lacks).mean())
         np.testing.assert_allclose(found[c], arrives, rtol=0.1)
         np.testing.assert_allclose(leaves[:, c], arrives * quick.mean_albedo[c], rtol=0.1)
-        np.testing.assert_allclose(sizes[c], [np.abs(lacks[cells]).sum(), light[cells].sum(), left], rtol=0.03)
+        here = light[cells].sum()
+        wanted = np.abs(lacks[cells]).sum(), here, left, here * (last - first) / n
+        np.testing.assert_allclose(sizes[c], wanted, rtol=0.03)
+    small = np.diff(quick.begin) < 4 * parts
+    assert small.any()
+    whole = [light[quick.begin[c] : quick.begin[c + 1]].sum() for c in np.flatnonzero(small)]
+    np.testing.assert_allclose(sizes[small, 3], whole, rtol=1e-3)
     out, clusters = np.full_like(light, -7), np.array([5, 2, 11], np.int32)
     rows = quick.indptr, quick.entries, quick.column_bits
     kernels.balance_clusters(clusters, quick.begin, *rows, direct, quick.short, quick.albedo, out)
@@ -192,7 +198,7 @@ def test_of_a_noisy_mean_as_much_is_taken_as_leaves_least(mean: float) -> None:
     direct = rng.normal(mean, 1, (n, 3)).astype(np.float32)
     light, missing, short = np.zeros((n, 4), np.float32), np.zeros((n, 4), np.float32), np.zeros(n, np.uint64)
     found, leaves = np.zeros((n_clusters, 3), np.float32), np.zeros((3, n_clusters), np.float32)
-    sizes = np.zeros((n_clusters, 3), np.float32)
+    sizes = np.zeros((n_clusters, 4), np.float32)
     white = np.ones((n, 3), np.float32)
     kernels.find_missing(
         begin, np.full(n, 1 / size, np.float32), np.zeros(n + 1, np.int64),
