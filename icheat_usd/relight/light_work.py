@@ -162,7 +162,14 @@ class Surroundings:
         """Whether the light of a one-light snapshot has the quick way."""
         return self.shadows is not None and has_points(int(alone.lights.kind[0]))
 
-    def bounce(self, direct: F32, radiance: F32, before: F32 | None, part: tuple[int, int] = (0, 1)) -> None:
+    def bounce(
+        self,
+        direct: F32,
+        radiance: F32,
+        before: F32 | None,
+        part: tuple[int, int] = (0, 1),
+        least: F32 | None = None,
+    ) -> None:
         """Bring light that leaves the cells up to date with their direct light, quickly.
 
         Parameters
@@ -171,7 +178,7 @@ class Surroundings:
             Changed. The closer to what it becomes, the better.
         before : (n_gather, 3) or None
             Direct light of which it came.
-        part : (int, int)
+        part, least
             See `QuickBounces.follow`.
         """
         if self.quick_bounces is None:
@@ -179,7 +186,7 @@ class Surroundings:
         elif before is None:
             self.quick_bounces.solve(direct, radiance)
         else:
-            self.quick_bounces.follow(radiance, before, direct, radiance, part)
+            self.quick_bounces.follow(radiance, before, direct, radiance, part, least)
 
     def lit_cells(self, alone: SceneSnapshot, sampler: LightSampler, cells: I64, seed: int, n: int) -> F32:
         """What some cells (m,) reflect of the light of a one-light snapshot, `n` shadow rays a patch point: (m, 3)."""
@@ -312,9 +319,12 @@ class Following:
 
     def bounce(self, direct: F32, radiance: F32, before: F32 | None, part: tuple[int, int] = (0, 1)) -> None:
         """`Surroundings.bounce`, less known errors."""
-        if self._bounces is not None:
-            before, direct = self._bounces.before, self._bounces.take_from(direct, radiance)
-        self._around.bounce(direct, radiance, before, part)
+        if self._bounces is None:
+            self._around.bounce(direct, radiance, before, part)
+        else:
+            before = self._bounces.before
+            less, least = self._bounces.take_from(direct, radiance)
+            self._around.bounce(less, radiance, before, part, least)
 
     def know_bounces(self, direct: F32, radiance: F32) -> None:
         """Take from later bounces what few rays get wrong of the light of all bounces, which is known now."""
