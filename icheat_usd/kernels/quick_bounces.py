@@ -12,11 +12,9 @@ from icheat_usd.kernels.lanes import add_short, add_short_fours, load_short, sto
 from icheat_usd.kernels.simd import (
     address_of,
     black,
-    brighter,
     channel,
     color_add,
     color_product,
-    darker,
     difference,
     fetch,
     load_color,
@@ -142,12 +140,6 @@ def _arrives(entries: np.ndarray, first: int, end: int, mask: int, short: int) -
 
 
 @kernel
-def _least_of(albedo: Any, arrives: Any, least: np.ndarray, i: int) -> Any:
-    """What cell `i` sends at least, see `find_missing`."""
-    return darker(color_product(albedo, arrives), load_rgb(address_of(least) + 12 * i))
-
-
-@kernel
 def _mean_for_others(total: Any, squares: Any, n: int) -> tuple[float, float]:
     """Share of the mean of `n` noisy values that best stands for others, and how far these are from it.
 
@@ -173,7 +165,6 @@ def find_missing(
     light: np.ndarray,
     short: np.ndarray,
     albedo: np.ndarray,
-    least: np.ndarray,
     mean_albedo: np.ndarray,
     part: int,
     parts: int,
@@ -195,8 +186,6 @@ def find_missing(
     entries : (n_entries,) uint32, of `shorten`
     direct, albedo : (n_gather, 3) float32
     light : (n_gather, 4) float32, 16-byte rows; the fourth column is 0
-    least : (n_gather, 3) float32, or no rows
-        What direct light below 0 leaves of reflected light, or all of it if that is less.
     mean_albedo : (n_clusters, 3) float32
     short : (n_gather,) uint64, of `take_change`
         What the rows reach: half as long, it stays in the cache of a core.
@@ -215,7 +204,7 @@ def find_missing(
     mask = (1 << column_bits) - 1
     for c in prange(len(begin) - 1):
         _find_missing(
-            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo, least,
+            begin[c], begin[c + 1], np.int64(c), share, indptr, entries, mask, direct, light, short, albedo,
             mean_albedo, part, parts, missing, arriving, leaves, sizes,
         )  # fmt: skip
 
@@ -223,9 +212,8 @@ def find_missing(
 @kernel
 def _find_missing(
     first: int, last: int, c: int, share: np.ndarray, indptr: np.ndarray, entries: np.ndarray, mask: int,
-    direct: np.ndarray, light: np.ndarray, short: np.ndarray, albedo: np.ndarray, least: np.ndarray,
-    mean_albedo: np.ndarray, part: int, parts: int, missing: np.ndarray, arriving: np.ndarray, leaves: np.ndarray,
-    sizes: np.ndarray,
+    direct: np.ndarray, light: np.ndarray, short: np.ndarray, albedo: np.ndarray, mean_albedo: np.ndarray, part: int,
+    parts: int, missing: np.ndarray, arriving: np.ndarray, leaves: np.ndarray, sizes: np.ndarray,
 ) -> None:  # fmt: skip
     """`find_missing` for cluster `c`, the cells from `first` up to `last`."""
     start, target = address_of(short), address_of(missing)
@@ -240,9 +228,6 @@ def _find_missing(
         now, reflected = load_color(light_0 + 16 * i), load_rgb(albedo_0 + 12 * i)
         arrives = _arrives(entries, indptr[i], indptr[i + 1], mask, start)
         lacks = color_add(reflected, arrives, difference(load_rgb(direct_0 + 12 * i), now))
-        if len(least) > 0:
-            left_of_it = _least_of(reflected, arrives, least, i)
-            lacks = brighter(lacks, difference(left_of_it, now))
         store_color(target + 16 * i, lacks)
         lacking, here = plus_size(lacking, lacks), plus_size(here, now)
         mean, white = scale_add(lacks, share[i], mean), scale_add(reflected, share[i], white)
@@ -315,7 +300,7 @@ def _add_missing(
 @parallel_kernel
 def balance_clusters(
     clusters: np.ndarray, begin: np.ndarray, indptr: np.ndarray, entries: np.ndarray, column_bits: int,
-    direct: np.ndarray, short: np.ndarray, albedo: np.ndarray, least: np.ndarray, out: np.ndarray,
+    direct: np.ndarray, short: np.ndarray, albedo: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Give all cells of some clusters the light of their balance: ``direct + albedo * (rows @ light)``.
 
@@ -325,22 +310,19 @@ def balance_clusters(
     mask = (1 << column_bits) - 1
     for k in prange(len(clusters)):
         first, last = begin[clusters[k]], begin[clusters[k] + 1]
-        _balance_cells(first, last, indptr, entries, mask, direct, short, albedo, least, out)
+        _balance_cells(first, last, indptr, entries, mask, direct, short, albedo, out)
 
 
 @kernel
 def _balance_cells(
     first: int, last: int, indptr: np.ndarray, entries: np.ndarray, mask: int, direct: np.ndarray, short: np.ndarray,
-    albedo: np.ndarray, least: np.ndarray, out: np.ndarray,
+    albedo: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """`balance_clusters` for the cells from `first` up to `last`."""
     direct_0, albedo_0, out_0 = address_of(direct), address_of(albedo), address_of(out)
     for i in range(first, last):
         arrives = _arrives(entries, indptr[i], indptr[i + 1], mask, address_of(short))
-        reflected = load_rgb(albedo_0 + 12 * i)
-        sent = color_add(reflected, arrives, load_rgb(direct_0 + 12 * i))
-        if len(least) > 0:
-            sent = brighter(sent, _least_of(reflected, arrives, least, i))
+        sent = color_add(load_rgb(albedo_0 + 12 * i), arrives, load_rgb(direct_0 + 12 * i))
         store_rgb(out_0 + 12 * i, sent)
 
 

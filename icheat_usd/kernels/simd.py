@@ -408,18 +408,6 @@ def difference(builder: Any, values: Any) -> Any:
 
 
 @_operation(color, color, color)
-def brighter(builder: Any, values: Any) -> Any:
-    """The larger of two, channel by channel."""
-    return builder.select(builder.fcmp_ordered(">", *values), *values)
-
-
-@_operation(color, color, color)
-def darker(builder: Any, values: Any) -> Any:
-    """The smaller of two, channel by channel."""
-    return builder.select(builder.fcmp_ordered("<", *values), *values)
-
-
-@_operation(color, color, color)
 def ratios(builder: Any, values: Any) -> Any:
     """``a / b`` where `b` is above 0, and 0 in the other channels."""
     a, b = values

@@ -38,7 +38,6 @@ from icheat_usd.lighting.sampler import LightSampler
 from icheat_usd.materials import effective_albedo, is_glossy, take_points
 from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside
 from icheat_usd.relight.grain import Grain, order_of_tiles
-from icheat_usd.relight.known_bounces import KnownBounces
 from icheat_usd.relight.known_noise import KnownNoise
 from icheat_usd.relight.view_light import ROUNDS, ROUNDS_AT_GRAIN, look_in_rounds
 from icheat_usd.samples import GatherSamples, ViewSamples
@@ -162,14 +161,7 @@ class Surroundings:
         """Whether the light of a one-light snapshot has the quick way."""
         return self.shadows is not None and has_points(int(alone.lights.kind[0]))
 
-    def bounce(
-        self,
-        direct: F32,
-        radiance: F32,
-        before: F32 | None,
-        part: tuple[int, int] = (0, 1),
-        least: F32 | None = None,
-    ) -> None:
+    def bounce(self, direct: F32, radiance: F32, before: F32 | None, part: tuple[int, int] = (0, 1)) -> None:
         """Bring light that leaves the cells up to date with their direct light, quickly.
 
         Parameters
@@ -178,7 +170,7 @@ class Surroundings:
             Changed. The closer to what it becomes, the better.
         before : (n_gather, 3) or None
             Direct light of which it came.
-        part, least
+        part : (int, int)
             See `QuickBounces.follow`.
         """
         if self.quick_bounces is None:
@@ -186,7 +178,7 @@ class Surroundings:
         elif before is None:
             self.quick_bounces.solve(direct, radiance)
         else:
-            self.quick_bounces.follow(radiance, before, direct, radiance, part, least)
+            self.quick_bounces.follow(radiance, before, direct, radiance, part)
 
     def lit_cells(self, alone: SceneSnapshot, sampler: LightSampler, cells: I64, seed: int, n: int) -> F32:
         """What some cells (m,) reflect of the light of a one-light snapshot, `n` shadow rays a patch point: (m, 3)."""
@@ -285,7 +277,7 @@ class ExactBounces:
 class KnownLight:
     """A light at rest whose bounces alone are solved anew."""
 
-    is_known = is_solved = True
+    is_known = True
 
     def __init__(self, around: Surroundings, direct: F32) -> None:
         self._around, self.direct = around, direct
@@ -304,40 +296,22 @@ class Following:
     """What is kept of a light from one first look to the next, while it moves."""
 
     def __init__(self, around: Surroundings) -> None:
-        self._around = around
-        self._n = 0  # first looks so far
+        self.n = 0  #: first looks so far
         self._noise: tuple[KnownNoise, KnownNoise] | None = None  # of first looks at cells and at view samples
         self.cells = None if around.cells is None else LastLook(around.cells)
         self.view = None if around.tiles is None else LastLook(around.tiles)
         self.patches = None if around.patches is None else CloserLook(around.patches, around.gather, around.beside)
-        self._bounces: KnownBounces | None = None
 
     def next_part(self) -> tuple[int, int]:
         """Of the cells, whose bounces are looked at this time; all of them at first."""
-        self._n += 1
-        return (0, 1) if self._n == 1 else (self._n % PARTS, PARTS)
+        self.n += 1
+        return (0, 1) if self.n == 1 else (self.n % PARTS, PARTS)
 
-    def bounce(self, direct: F32, radiance: F32, before: F32 | None, part: tuple[int, int] = (0, 1)) -> None:
-        """`Surroundings.bounce`, less known errors."""
-        if self._bounces is None:
-            self._around.bounce(direct, radiance, before, part)
-        else:
-            before = self._bounces.before
-            less, least = self._bounces.take_from(direct, radiance)
-            self._around.bounce(less, radiance, before, part, least)
-
-    def know_bounces(self, direct: F32, radiance: F32) -> None:
-        """Take from later bounces what few rays get wrong of the light of all bounces, which is known now."""
-        quick = self._around.quick_bounces
-        off = None if quick is None else quick.off_balance(radiance, direct)
-        self._bounces = None if off is None else KnownBounces(off, radiance, direct)
-
-    def know(self, alone: SceneSnapshot, look: tuple[F32, F32], known: tuple[F32, F32]) -> None:
+    def know(self, around: Surroundings, alone: SceneSnapshot, look: tuple[F32, F32], known: tuple[F32, F32]) -> None:
         """Take from later first looks what is noise in one, at cells and at view samples, by what is known there.
 
         `alone` is the light as it was then.
         """
-        around = self._around
         assert around.tiles is not None
         # Smoothed, a sun's patch would leave ghosts of its borders where these were.
         smooths = int(alone.lights.kind[0]) != LightKind.DISTANT
@@ -381,7 +355,6 @@ class MovingLight:
         self._sampler: LightSampler | None = None
         self._exact: ExactBounces | None = None
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
-        self.is_solved = False  #: whether that radiance has all bounces
         self.following: Following | None = None  #: set from before to spare work
         self._cells = np.empty((0, 3), np.float32)  # from the first step on
         self._grain: Grain | None = None  # the same
@@ -391,9 +364,7 @@ class MovingLight:
         """Whether enough rounds were made for `show` to know noise by what they found."""
         return self._step >= 2 * min(_KNOWN_ROUNDS, self._rounds)
 
-    def show(
-        self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None, is_solved: bool = False
-    ) -> None:
+    def show(self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None) -> None:
         """First look: a shadow ray per cell, more where that leaves noise, and one per view sample at shadows' edges.
 
         Near the look before, a part of these rays is enough.
@@ -403,22 +374,18 @@ class MovingLight:
         known : SceneSnapshot, optional
             The light as it was when many rays found `self.direct` and `view_direct`: noise of a look there is taken
             from looks from now on.
-        is_solved : bool
-            Whether `radiance` is that of all bounces of `self.direct`: errors of a few are taken from now on, too.
         """
         around = self._around
         self.following = last = self.following or Following(around)
         if known is not None and self.direct is not None:
             look = np.empty_like(self.direct), np.empty_like(view_direct)
             MovingLight(around, known, self._seed, self._rounds, None)._look(last, *look)
-            last.know(known, look, (self.direct, view_direct))
-        if is_solved and self.direct is not None:
-            last.know_bounces(self.direct, radiance)
+            last.know(around, known, look, (self.direct, view_direct))
         direct = np.empty((around.gather.n, 3), np.float32)
 
         def bounce() -> None:
             last.clean_cells(direct)
-            last.bounce(direct, radiance, self.direct, last.next_part())
+            around.bounce(direct, radiance, self.direct, last.next_part())
 
         self._look(last, direct, view_direct, bounce)
         last.clean_view(view_direct)
@@ -460,7 +427,7 @@ class MovingLight:
             self._exact = self._exact or ExactBounces(around, direct)
             if self._exact.step(radiance):
                 return True
-            self.direct, self.is_solved = direct, True
+            self.direct = direct
             return self._light_grain(view_direct) or self._light_exposed(view_direct)
         share = np.float32(1.0 / (turn + 1))
         if at_view:
@@ -468,8 +435,7 @@ class MovingLight:
         else:
             self._cells += around.cell_means(self._round(around.patches, turn))
             direct = self._cells * share
-            bounce = around.bounce if self.following is None else self.following.bounce
-            bounce(direct, radiance, self.direct)
+            around.bounce(direct, radiance, self.direct)
             self.direct = direct
         return True
 
@@ -567,17 +533,14 @@ class AnyLight:
         self.is_known = False  #: whether enough rounds were made for `show` to know noise by what they found
         self.bins: BinnedSky | None = None  #: of a dome; may be set to spare finding them again
         self.direct: F32 | None = None  #: at the cells, of which the radiance came; set from before to spare work
-        self.is_solved = False  #: whether that radiance has all bounces
         self._cells = np.empty((0, 3), np.float32)  # from the first step on
         self._view = np.empty((1, 0, 3), np.float32)  # from the first look at it on
         self.following: Following | None = None  #: set from before to spare work
 
-    def show(
-        self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None, is_solved: bool = False
-    ) -> None:
+    def show(self, radiance: F32, view_direct: F32, known: SceneSnapshot | None = None) -> None:
         """First look: domes by what is seen of the sky, others by one shadow ray per cell and view sample.
 
-        `known` and `is_solved` are those of `MovingLight.show`, for domes.
+        `known` is that of `MovingLight.show`, for domes.
         """
         around = self._around
         if around.shadows is not None and self._alone.lights.kind[0] == LightKind.DOME:
@@ -586,13 +549,11 @@ class AnyLight:
             if known is not None and self.direct is not None:
                 look = np.empty_like(self.direct), np.empty_like(view_direct)
                 self._look_at_sky(known, *look)
-                last.know(known, look, (self.direct, view_direct))
-            if is_solved and self.direct is not None:
-                last.know_bounces(self.direct, radiance)
+                last.know(around, known, look, (self.direct, view_direct))
             direct = np.empty((around.gather.n, 3), np.float32)
             self._look_at_sky(self._alone, direct, view_direct)
             last.clean_cells(direct)
-            last.bounce(direct, radiance, self.direct, last.next_part())
+            around.bounce(direct, radiance, self.direct, last.next_part())
             self.direct = direct
             last.clean_view(view_direct)
             return
@@ -626,7 +587,7 @@ class AnyLight:
         self._exact = self._exact or ExactBounces(around, self._cells)
         if self._exact.step(radiance):
             return True
-        self.direct, self.is_solved = self._cells, True
+        self.direct = self._cells
         if not around.view.n:
             return False
         if len(self._samplers) < 2:

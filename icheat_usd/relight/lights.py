@@ -254,8 +254,7 @@ class LiveLights:
             work.bins = state.bins
         work.direct = state.direct
         work.following = state.following
-        is_solved = state.work is None or state.work.is_solved
-        work.show(self.radiance[light], self.view_direct[light], known, is_solved)
+        work.show(self.radiance[light], self.view_direct[light], known)
         state.work, state.direct, state.following = work, work.direct, work.following
         state.bins = work.bins if isinstance(work, AnyLight) else None
         self.revision += 1

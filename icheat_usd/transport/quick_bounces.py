@@ -19,7 +19,6 @@ _FEW_CLUSTERS = 256  # whose bounces add up in some hundredths of a second
 _CELLS_PER_CLUSTER = 32  # where there are more clusters than that
 _FIRST_STEPS = 3  # of light from nothing: what is caught between white surfaces is most of a pixel's, and comes last
 _ALL = (0, 1)  # every cell
-_NONE: F32 = np.empty((0, 3), np.float32)
 
 _WHITE, _WHITE_COUNTS = 0.9, 8  # cells of a larger albedo stand for so many
 
@@ -79,24 +78,19 @@ class QuickBounces:
     def solve(self, direct: F32, out: F32 | None = None) -> F32:
         """Approximation of `solve_bounces` for one light: (n_gather, 3) to (n_gather, 3)."""
         out = np.empty_like(direct) if out is None else out
-        leaves, _ = self._take_change(_NONE, _NONE, direct)
+        none = np.empty((0, 3), np.float32)
+        leaves, _ = self._take_change(none, none, direct)
         if not self.lasting:  # one bounce is what light without any lacks
             self._step(direct, _ALL, 1.0, out)
             return out
         # Nothing grows in so few steps.
-        self._add(leaves, None, _ALL, 1.0, _NONE)
+        self._add(leaves, None, _ALL, 1.0, none)
         for _ in range(_FIRST_STEPS):
             self._step(direct, _ALL, 1.0, out)
         return out
 
     def follow(
-        self,
-        radiance: F32,
-        before: F32,
-        direct: F32,
-        out: F32 | None = None,
-        part: tuple[int, int] = (0, 1),
-        least: F32 | None = None,
+        self, radiance: F32, before: F32, direct: F32, out: F32 | None = None, part: tuple[int, int] = (0, 1)
     ) -> F32:
         """Light for direct light that has changed from `before`, of which came `radiance`; all (n_gather, 3).
 
@@ -107,8 +101,6 @@ class QuickBounces:
         part : (int, int)
             Rows of every so-manieth cell alone are looked at, from this number on; for the others clusters stand,
             until their number comes.
-        least : (n_gather, 3), optional
-            What direct light below 0 leaves of reflected light, or all of it if that is less.
         """
         out = np.empty_like(direct) if out is None else out
         if not self.lasting:
@@ -116,28 +108,15 @@ class QuickBounces:
         leaves, (changed, all_of_it) = self._take_change(radiance, before, direct)
         if changed > all_of_it:
             return self.solve(direct, out)
-        self._add(leaves, None, _ALL, self.sent_on, _NONE)
-        least = _NONE if least is None else least
-        lacking, light, left, of_all = self._step(direct, part, self.sent_on, out, least).T
+        self._add(leaves, None, _ALL, self.sent_on, np.empty((0, 3), np.float32))
+        lacking, light, left, of_all = self._step(direct, part, self.sent_on, out).T
         if lacking.sum() > _FAR * light.sum():
-            self._step(direct, _ALL, self.sent_on, out, least)
+            self._step(direct, _ALL, self.sent_on, out)
         elif len(worst := self._worst(left, float(of_all.sum()))):
             rows = self.indptr, self.entries, self.column_bits
             take_back()
-            kernels.balance_clusters(worst, self.begin, *rows, direct, self.short, self.albedo, least, out)
+            kernels.balance_clusters(worst, self.begin, *rows, direct, self.short, self.albedo, out)
         return out
-
-    def off_balance(self, radiance: F32, direct: F32) -> F32 | None:
-        """What the few rays of the rows would add to the light of all bounces of direct light, all (n_gather, 3).
-
-        Where `follow` is given so much less direct light, it stays at that light. None where there are too few bounces
-        for a balance.
-        """
-        if not self.lasting:
-            return None
-        self._take_change(radiance, direct, direct)
-        self._find_missing(direct, _ALL)
-        return self.scratch[1, :, :3].copy()
 
     def _worst(self, left: F32, light: float) -> I32:
         """Clusters where most is still missing, worst first: squares of it (n_clusters,), beside all cells' light."""
@@ -156,14 +135,8 @@ class QuickBounces:
         )
         return leaves, sizes.sum(axis=0)
 
-    def _step(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32, least: F32 = _NONE) -> F32:
+    def _step(self, direct: F32, part: tuple[int, int], sent_on: float, out: F32) -> F32:
         """Add what is missing; (n_clusters, 4) `sizes` of `kernels.find_missing`, of before."""
-        leaves, arriving, sizes = self._find_missing(direct, part, least)
-        self._add(leaves, arriving, part, sent_on, out)
-        return sizes
-
-    def _find_missing(self, direct: F32, part: tuple[int, int], least: F32 = _NONE) -> tuple[F32, F32, F32]:
-        """Put what is missing into the scratch; `leaves`, `arriving` and `sizes` of `kernels.find_missing`."""
         light, missing = self.scratch
         leaves, sizes = np.empty((3, self.n_clusters), np.float32), np.empty((self.n_clusters, 4), np.float32)
         arriving = np.empty((self.n_clusters, 3), np.float32)
@@ -177,7 +150,6 @@ class QuickBounces:
             light,
             self.short,
             self.albedo,
-            least,
             self.mean_albedo,
             *part,
             missing,
@@ -185,7 +157,8 @@ class QuickBounces:
             leaves,
             sizes,
         )
-        return leaves, arriving, sizes
+        self._add(leaves, arriving, part, sent_on, out)
+        return sizes
 
     def _add(self, leaves: F32, here: F32 | None, part: tuple[int, int], sent_on: float, out: F32) -> None:
         """Add the later bounces of light that leaves clusters; and what is missing, which arrives as `here` says."""
