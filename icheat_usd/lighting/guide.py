@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from icheat_usd.kernels.random import hash_combine
 from icheat_usd.lighting.controls import tracer_for
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.steps import Steps
 from icheat_usd.tracing import Tracer, spawn_points, transmittance
 
 _CELLS = BANDS * COLUMNS
@@ -31,19 +31,6 @@ _CELLS = BANDS * COLUMNS
 _POINTS = 1 << 15  # that vote for the leaves: more only make the tree slower to build
 _PLACES = 64  # in each cell of a plane, that its rays go to: looking up an image costs more than tracing
 _GROUPS_AT_ONCE = 64  # densities learnt together: an eighth of a million rays
-
-
-Result = TypeVar("Result")
-Steps = Generator[None, None, Result]  #: work in steps, so that others come to their turn
-
-
-def all_steps(steps: Steps[Result]) -> Result:
-    """What comes of some work, done without a pause."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast(Result, end.value)
 
 
 class Effort(NamedTuple):

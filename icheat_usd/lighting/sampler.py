@@ -9,9 +9,10 @@ import numpy as np
 from icheat_usd.kernels.environment import dome_columns_cdf
 from icheat_usd.kernels.guide import Guide
 from icheat_usd.kernels.lights import LightTables
-from icheat_usd.lighting.guide import Effort, Steps, all_steps, learn_guide, no_guide
+from icheat_usd.lighting.guide import Effort, learn_guide, no_guide
 from icheat_usd.materials import points_on_surface
 from icheat_usd.scene import F32, F64, I32, I64, LightKind, SceneSnapshot, SurfacePoints, Texture
+from icheat_usd.steps import Steps, all_steps
 from icheat_usd.tracing import Tracer
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec.709

@@ -20,7 +20,7 @@ from icheat_usd.lighting import (
 )
 from icheat_usd.lighting.controls import darken, hidden_instances, receives, tracer_for
 from icheat_usd.lighting.domes import BinnedSky, SeenSky, see_sky, white_sky
-from icheat_usd.lighting.guide import LITTLE, Steps
+from icheat_usd.lighting.guide import LITTLE
 from icheat_usd.lighting.points import has_points
 from icheat_usd.lighting.quick import (
     LastLook,
@@ -42,11 +42,12 @@ from icheat_usd.relight.known_noise import KnownNoise
 from icheat_usd.relight.view_light import ROUNDS, ROUNDS_AT_GRAIN, look_in_rounds
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, I32, I64, Bool, LightKind, SceneSnapshot
+from icheat_usd.steps import Steps
 from icheat_usd.tracing import Tracer
 from icheat_usd.tracing.embree import EmbreeTracer
 from icheat_usd.transport import Bounces
 from icheat_usd.transport.bounces import bounce_by_bounce
-from icheat_usd.transport.quick_bounces import PARTS, QuickBounces, build_quick_bounces
+from icheat_usd.transport.quick_bounces import PARTS, QuickBounces, build_quick_bounces, suit_to_light
 from icheat_usd.transport.sparse import SparseRows
 
 # Smoother lobes are found by rays of their own at rest: points of the light miss them.
@@ -83,7 +84,10 @@ class SparseView(NamedTuple):
 
 @dataclass(eq=False)
 class Surroundings:
-    """What every light of a view shines on; made once, but that `bounces` may be taken from more rays later."""
+    """What every light of a view shines on; made once, but that `bounces` may be taken from more rays later.
+
+    Quick bounces are suited to other light when lights rest.
+    """
 
     snapshot: SceneSnapshot
     tracer: Tracer
@@ -179,6 +183,12 @@ class Surroundings:
             self.quick_bounces.solve(direct, radiance)
         else:
             self.quick_bounces.follow(radiance, before, direct, radiance, part)
+
+    def suit_bounces(self, importance: F32) -> Steps[None]:
+        """Thin the rows of quick bounces anew, for light like `importance` (n_gather,)."""
+        if self.quick_bounces is not None:
+            suiting = suit_to_light(self.quick_bounces, self.bounces, self.n_bounces, importance)
+            self.quick_bounces = yield from suiting
 
     def lit_cells(self, alone: SceneSnapshot, sampler: LightSampler, cells: I64, seed: int, n: int) -> F32:
         """What some cells (m,) reflect of the light of a one-light snapshot, `n` shadow rays a patch point: (m, 3)."""

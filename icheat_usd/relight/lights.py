@@ -29,8 +29,13 @@ from icheat_usd.relight.light_work import (
 )
 from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
+from icheat_usd.steps import Steps
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport import Bounces, CellLight, sum_lights
+
+# Light of all cells alike, beside the mean of each light that rests, that rows of bounces on the move are made for:
+# what is lit by none of them now may be once a light moves.
+_ALIKE = 4.0
 
 
 @dataclass
@@ -90,6 +95,8 @@ class LiveLights:
         self.gains: F32 = np.ones((n, 3), np.float32)  #: (n_lights, 3)
         self.radiance: F32 = np.zeros((n, gather.n, 3), np.float32)  #: (n_lights, n_gather, 3) at gain 1
         self.view_direct: F32 = np.zeros((n, view.n, 3), np.float32)  #: (n_lights, n_view, 3) at gain 1
+        self._suiting: Steps[None] | None = None  # of quick bounces to the lights, once these rest
+        self._suited = -1  # what `moves` was then
         for light in range(n):
             self._show(light)
 
@@ -217,8 +224,20 @@ class LiveLights:
                     state.work = state.following = None
                 self.revision += 1
                 self.moves = state.moved = self.moves + 1
-                break
-        return any(state.work is not None for state in self._lights)
+                return True
+        return self._suit_bounces()
+
+    def _suit_bounces(self) -> bool:
+        """One step of making rows of which these lights, and what is like them, has little noise; False when done."""
+        if self._suited != self.moves:
+            importance = np.full(self.radiance.shape[1], _ALIKE, np.float32)
+            for radiance in self.radiance:
+                light = radiance.mean(axis=1)
+                importance += light / max(light.mean(), np.finfo(np.float32).tiny)
+            self._suiting, self._suited = self._around.suit_bounces(importance), self.moves
+        if self._suiting is not None and next(self._suiting, True):
+            self._suiting = None
+        return self._suiting is not None
 
     def stop_following(self) -> None:
         """Let go of what lights in motion are followed with, as their next move may be long in coming."""

@@ -17,7 +17,6 @@ from icheat_usd.tracing import Tracer
 from icheat_usd.transport.rays import MeasuredRows, RowBuilder
 from icheat_usd.transport.sparse import SparseRows
 
-_FEW_RAYS = 128  # of a row, that light on the move is content with: its time goes by the entries
 _CONVERGED = 1e-4  # relative change per bounce: far below what a display shows
 
 
@@ -27,7 +26,6 @@ class Bounces:
 
     rows: SparseRows  #: (n_gather x n_gather) form factors without albedo; row sums at most 1
     albedo: F32  #: (n_gather, 3) mean reflectance of the cells
-    few: SparseRows  #: rows of some of the rays alone; `rows` themselves where these are few
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +70,11 @@ def build_bounces(
     Rays start from the patch points, so that a row is the mean over its cell.
     """
     builder = RowBuilder(snapshot, tracer, gather, seed)
-
-    def measure(n_rays: int, purpose: int) -> MeasuredRows:
-        points = gather.patch_points, gather.cell_begin, gather.number
-        return builder.measure(*points, n_rays, purpose, progress, "bounce rays")
-
-    few = measure(min(rays_per_row, _FEW_RAYS), 1)
-    # A sequence of their own, since either is spread over all points of a cell.
-    rows = few.continued(measure(rays_per_row - few.n_rays, 3)) if rays_per_row > few.n_rays else few
+    points = gather.patch_points, gather.cell_begin, gather.number
+    rows = builder.diffuse_rows(*points, rays_per_row, 1, progress, "bounce rays")
     albedo = np.empty((gather.n, 3), np.float32)
     row_kernels.mean_over_segments(gather.cell_begin, effective_albedo(gather.patch_points), albedo)
-    return Bounces(rows.cells, albedo, few.cells)
+    return Bounces(rows, albedo)
 
 
 def more_bounces(
@@ -96,9 +88,10 @@ def more_bounces(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Bounces:
-    """Bounces whose rows were measured with `n_rays` rays, by `n_more` others besides; `few` stays."""
+    """Bounces whose rows were measured with `n_rays` rays, by `n_more` others besides."""
     points = gather.patch_points, gather.cell_begin, gather.number
     builder = RowBuilder(snapshot, tracer, gather, seed)
+    # A sequence of their own, since either is spread over all points of a cell.
     more = builder.measure(*points, n_more, 4, progress, "more bounce rays")
     return replace(bounces, rows=MeasuredRows(bounces.rows, n_rays).continued(more).cells)
 

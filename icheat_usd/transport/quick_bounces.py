@@ -11,8 +11,15 @@ from icheat_usd.kernels import quick_bounces as kernels
 from icheat_usd.kernels.workers import take_back
 from icheat_usd.samples import ClusterTree
 from icheat_usd.scene import F32, I32, I64
+from icheat_usd.steps import Steps, all_steps
 from icheat_usd.transport.bounces import Bounces
-from icheat_usd.transport.sparse import SparseRows
+from icheat_usd.transport.sparse import SparseRows, concatenate_rows
+from icheat_usd.transport.thinning import thin_rows
+
+# Of a row that light on the move goes by: its time goes by the entries.
+_ENTRIES = 96
+# Entries of all rows that are thinned at a time, and bounces of all cells: some hundredths of a second.
+_ENTRIES_AT_ONCE, _BOUNCES_AT_ONCE = 1 << 22, 4
 
 _CLUSTERS = 1024  # at most: their matrices take 12 MB
 _FEW_CLUSTERS = 256  # whose bounces add up in some hundredths of a second
@@ -51,7 +58,7 @@ _FAR = 0.1
 
 @dataclass(frozen=True, eq=False)
 class QuickBounces:
-    """Bounce rows of few rays in a word per entry, and the mean rows of clusters of neighbouring cells.
+    """Thinned bounce rows in a word per entry, and the mean rows of clusters of neighbouring cells.
 
     Light `g` after all bounces balances ``g = d + A R g`` (d direct light, A albedo, R rows); see `lasting_albedo`
     for those that are not all. A step adds what is missing, ``r = d + A R g - g`` with the exact rows, and what
@@ -178,18 +185,17 @@ class QuickBounces:
 def build_quick_bounces(
     bounces: Bounces, tree: ClusterTree, n_bounces: int = 16, most_clusters: int | None = None
 ) -> QuickBounces:
-    """Shorten the rows, merge them over nodes of the tree and add up all bounces after the first between those.
+    """Thin the rows, merge them over nodes of the tree and add up all bounces after the first between those.
 
     Parameters
     ----------
     n_bounces : int
         Diffuse reflections before the last one, as for `solve_bounces`; at least 2.
     """
-    rows, lasting = bounces.few, n_bounces >= _LASTING
+    rows = thin_rows(bounces.rows, _ENTRIES, np.ones(tree.n_leaves, np.float32))
+    lasting = n_bounces >= _LASTING
     albedo = lasting_albedo(rows, bounces.albedo, n_bounces) if lasting else bounces.albedo
     bits = max(1, int(tree.n_leaves - 1).bit_length())
-    entries = np.empty(rows.n_entries, np.uint32)
-    kernels.shorten(rows.indices, rows.weights, bits, entries)
     if most_clusters is None:
         most_clusters = min(_CLUSTERS, max(_FEW_CLUSTERS, tree.n_leaves // _CELLS_PER_CLUSTER))
     begin = _clusters(tree, bounces.albedo, most_clusters)
@@ -204,7 +210,7 @@ def build_quick_bounces(
     matrices = [_all_bounces(factors, channel, n_bounces - 2) for channel in sent_on.T]
     quick = QuickBounces(
         rows.indptr,
-        entries,
+        _short_entries(rows, bits),
         bits,
         albedo,
         mean_albedo,
@@ -216,19 +222,58 @@ def build_quick_bounces(
         np.zeros((2, tree.n_leaves, 4), np.float32),
         np.zeros(tree.n_leaves, np.uint64),
     )
-    return _steady(quick) if lasting else quick
+    return all_steps(_steady(quick)) if lasting else quick
 
 
-def _steady(quick: QuickBounces) -> QuickBounces:
-    """The same with clusters that send on less, as far as errors would else grow from frame to frame."""
+def suit_to_light(quick: QuickBounces, bounces: Bounces, n_bounces: int, importance: F32) -> Steps[QuickBounces]:
+    """The same with rows that are thinned for light that is like some other; in steps of some hundredths of a second.
+
+    What is bright there keeps its entries, so that light which is alike has as little noise as rows of all rays
+    leave.
+
+    Parameters
+    ----------
+    bounces : Bounces
+        Of the same cells; their rows may have more rays than those that `quick` was made from.
+    n_bounces : int
+        As for `build_quick_bounces`.
+    importance : (n_gather,) float32
+        See `thin_rows`.
+    """
+    parts, first = [], 0
+    while first < bounces.rows.n_rows:
+        end = bounces.rows.indptr[first] + _ENTRIES_AT_ONCE
+        last = max(first + 1, int(np.searchsorted(bounces.rows.indptr, end, side="right")) - 1)
+        parts.append(thin_rows(bounces.rows.rows(first, last), _ENTRIES, importance, first))
+        first = last
+        yield
+    rows = concatenate_rows(parts, bounces.rows.n_columns)
+    suited = replace(quick, indptr=rows.indptr, entries=_short_entries(rows, quick.column_bits))
+    if not quick.lasting:
+        return suited
+    albedo = yield from _lasting_albedo(rows, bounces.albedo, n_bounces)
+    mean_albedo = np.add.reduceat(albedo * quick.share[:, None], quick.begin[:-1], axis=0, dtype=np.float32)
+    return (yield from _steady(replace(suited, albedo=albedo, mean_albedo=mean_albedo)))
+
+
+def _short_entries(rows: SparseRows, column_bits: int) -> NDArray[np.uint32]:
+    entries = np.empty(rows.n_entries, np.uint32)
+    kernels.shorten(rows.indices, rows.weights, column_bits, entries)
+    return entries
+
+
+def _steady(quick: QuickBounces) -> Steps[QuickBounces]:
+    """The same with clusters that send on less, as far as errors would else grow from frame to frame; in steps."""
     for factor in _FACTORS:
-        tried = replace(quick, sent_on=factor)
-        if _growth(tried) < _SHRINKS:
-            return tried
+        if factor <= quick.sent_on:
+            tried = replace(quick, sent_on=factor)
+            growth = yield from _growth(tried)
+            if growth < _SHRINKS:
+                return tried
     return replace(quick, sent_on=0.0)
 
 
-def _growth(quick: QuickBounces) -> float:
+def _growth(quick: QuickBounces) -> Steps[float]:
     """Factor of an error in one step, once what shrinks faster is gone: of light where there should be none."""
     n = len(quick.albedo)
     dark, light = np.zeros((n, 3), np.float32), np.random.default_rng(0).standard_normal((n, 3), np.float32)
@@ -236,6 +281,8 @@ def _growth(quick: QuickBounces) -> float:
     for step in range(_TRIED):
         quick.follow(light, dark, dark, light, (step % PARTS, PARTS))
         sizes[step] = np.abs(light).sum()
+        if step % PARTS == PARTS - 1:
+            yield
     before, after = sizes[-1 - _LAST_TRIED], sizes[-1]
     return float((after / before) ** (1 / _LAST_TRIED)) if before > 0 else 0.0
 
@@ -249,10 +296,16 @@ def lasting_albedo(rows: SparseRows, albedo: F32, n_bounces: int) -> F32:
     v) v``, by which no error is kept (the bound of Collatz and Wielandt; Horn and Johnson 2013, Matrix Analysis,
     section 8.1).
     """
+    return all_steps(_lasting_albedo(rows, albedo, n_bounces))
+
+
+def _lasting_albedo(rows: SparseRows, albedo: F32, n_bounces: int) -> Steps[F32]:
     light, arriving = np.ones_like(albedo), np.zeros_like(albedo)
-    for _ in range(n_bounces - 1):
+    for bounce in range(1, n_bounces):
         arriving = rows.matmul(light)
         light = 1 + albedo * arriving
+        if bounce % _BOUNCES_AT_ONCE == 0:
+            yield
     return np.asarray(albedo * arriving / np.maximum(rows.matmul(light), np.finfo(np.float32).tiny))
 
 

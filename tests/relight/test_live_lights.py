@@ -13,7 +13,8 @@ from icheat_usd.lighting.change import LightError, texture_image
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import LightKind, SceneSnapshot
 from icheat_usd.session.seen_light import SeenLight
-from icheat_usd.transport import light_cells, more_bounces
+from icheat_usd.transport import light_cells, more_bounces, solve_bounces
+from icheat_usd.transport.quick_bounces import lasting_albedo
 from tests.pipeline import Pipeline
 from tests.scenes import (
     Image,
@@ -41,14 +42,16 @@ def gradient_image() -> Image:
     return Image(np.repeat(level[..., None], 3, axis=2).astype(np.float32))
 
 
-def build(pipeline: Pipeline, snapshot: SceneSnapshot | None = None, light_samples: int = 4) -> LiveLights:
+def build(
+    pipeline: Pipeline, snapshot: SceneSnapshot | None = None, light_samples: int = 4, n_bounces: int = 6
+) -> LiveLights:
     return LiveLights(
         snapshot or pipeline.snapshot,
         pipeline.tracer,
         pipeline.view,
         pipeline.gather,
         pipeline.bounces,
-        n_bounces=6,
+        n_bounces=n_bounces,
         light_samples=light_samples,
         seed=3,
     )
@@ -333,3 +336,26 @@ def test_a_camera_that_sees_no_surface_needs_no_light() -> None:
     assert lights.view_direct.shape == (2, 0, 3)
     lights.change(0, to_world=down(0, 0, 0))
     settle(lights)
+
+
+def test_light_that_is_moved_from_rest_bounces_with_little_noise() -> None:
+    """As it bounces by all rays: rows for light on the move are made for the lights that rest, of which this is one."""
+    parts = Pipeline(room(RECT, SPHERE), n_gather=1000, bounce_rays=1024)
+    lights, new = (build(parts, n_bounces=16) for _ in range(2))
+    settle(lights)
+    direct, radiance = lights._lights[0].direct, lights.radiance[0].copy()
+    assert direct is not None
+    there = direct * np.linspace(0.8, 1.2, len(direct), dtype=np.float32)[:, None]
+    lasting = replace(parts.bounces, albedo=lasting_albedo(parts.bounces.rows, parts.bounces.albedo, 16))
+    exact = solve_bounces(lasting, there[None], 200)[0]
+
+    def error(lights: LiveLights) -> float:
+        found = radiance.copy()
+        for before in (direct, *[there] * 5):
+            lights._around.bounce(there, found, before)
+        return float(np.sqrt(((found - exact) ** 2).sum()))
+
+    assert error(lights) < 0.6 * error(new)
+    seen = [lights.revision, lights.moves]
+    assert not lights.refine()
+    assert [lights.revision, lights.moves] == seen

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,14 +13,20 @@ import pytest
 from icheat_usd.kernels import quick_bounces as kernels
 from icheat_usd.transport import Bounces, SparseRows, solve_bounces
 from icheat_usd.transport import quick_bounces as module
-from icheat_usd.transport.quick_bounces import build_quick_bounces, cluster_begins, lasting_albedo
+from icheat_usd.transport.quick_bounces import (
+    QuickBounces,
+    build_quick_bounces,
+    cluster_begins,
+    lasting_albedo,
+    suit_to_light,
+)
 from tests.pipeline import Pipeline
 from tests.scenes import cornell
 
 
 @pytest.fixture(scope="module")
 def room() -> Pipeline:
-    return Pipeline(cornell(12, 12), n_gather=1500, bounce_rays=128, light_samples=4, n_bounces=9)
+    return Pipeline(cornell(12, 12), n_gather=1500, bounce_rays=96, light_samples=4, n_bounces=9)
 
 
 def test_clusters_of_single_cells_give_the_exact_bounces(room: Pipeline) -> None:
@@ -61,7 +68,7 @@ def test_more_clusters_come_closer_to_the_light_of_the_view(room: Pipeline) -> N
 
 def _balance(bounces: Bounces, direct: np.ndarray) -> np.ndarray:
     """What 16 bounces are taken to balance at, by many plain ones."""
-    lasting = replace(bounces, albedo=lasting_albedo(bounces.few, bounces.albedo, 16))
+    lasting = replace(bounces, albedo=lasting_albedo(bounces.rows, bounces.albedo, 16))
     return solve_bounces(lasting, direct[None], 200)[0]
 
 
@@ -115,6 +122,48 @@ def test_noise_at_a_part_of_the_cells_does_not_spread_to_the_others(room: Pipeli
     assert np.sqrt((off**2).mean()) < 0.06 * np.sqrt((noise[in_part] ** 2).mean())
 
 
+def test_rows_suited_to_a_light_leave_it_and_its_like_little_noise() -> None:
+    """A light that is brightest in one corner, and moves on from there."""
+    many = Pipeline(cornell(12, 12), n_gather=1500, bounce_rays=2048)
+    position = many.gather.points.position
+    quick = build_quick_bounces(many.bounces, many.gather.tree, 16, most_clusters=64)
+
+    def bright(corner: tuple[float, float, float]) -> np.ndarray:
+        near = np.exp(-((position - np.array(corner)) ** 2).sum(axis=1) / 0.08)
+        return (near[:, None] * [1.0, 0.8, 0.6]).astype(np.float32)
+
+    def error(quick: QuickBounces, direct: np.ndarray) -> float:
+        """Of what rows are balanced at."""
+        exact, found = _balance(many.bounces, direct), quick.solve(direct)
+        for _ in range(6):
+            found = quick.follow(found, direct, direct)
+        return float(np.sqrt(((found - exact) ** 2).sum() / (exact**2).sum()))
+
+    corner, beside, opposite = position.min(axis=0), position.min(axis=0) + 0.15, position.max(axis=0)
+    before = _balance(many.bounces, bright(corner)).mean(axis=1)
+    suited = list(_steps(quick, many, 4 + before / before.mean()))[-1]
+    assert np.diff(suited.indptr).max() <= 97
+    assert error(suited, bright(corner)) < 0.3 * error(quick, bright(corner))
+    assert error(suited, bright(beside)) < 0.4 * error(quick, bright(beside))
+    assert error(suited, bright(opposite)) < 1.2 * error(quick, bright(opposite))
+
+
+def test_rows_are_suited_in_any_number_of_steps_to_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    many = Pipeline(cornell(8, 8), n_gather=600, bounce_rays=512)
+    quick = build_quick_bounces(many.bounces, many.gather.tree, 16)
+    importance = np.random.default_rng(0).uniform(0.1, 9, many.gather.n).astype(np.float32)
+    at_once = list(_steps(quick, many, importance))
+    monkeypatch.setattr(module, "_ENTRIES_AT_ONCE", 10_000)
+    piecewise = list(_steps(quick, many, importance))
+    assert len(piecewise) > len(at_once) + 5
+    for name in ("indptr", "entries", "albedo", "mean_albedo", "sent_on"):
+        np.testing.assert_array_equal(getattr(piecewise[-1], name), getattr(at_once[-1], name))
+
+
+def _steps(quick: QuickBounces, parts: Pipeline, importance: np.ndarray) -> Iterator[QuickBounces | None]:
+    yield (yield from suit_to_light(quick, parts.bounces, 16, importance))
+
+
 def test_a_second_look_goes_to_where_light_is_missing(room: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small bright patch turns dark: a look at a sixteenth of the cells finds half of what is missing."""
     direct, position = room.cell_light.direct[0], room.gather.points.position
@@ -160,7 +209,7 @@ def test_missing_light_is_that_of_plain_loops(room: Pipeline) -> None:
         quick.begin, quick.share, quick.indptr, quick.entries, quick.column_bits, direct, quick.scratch[0],
         quick.short, quick.albedo, quick.mean_albedo, part, parts, missing, found, leaves, sizes,
     )  # fmt: skip
-    lacks = direct + quick.albedo * room.bounces.few.matmul(light) - light
+    lacks = direct + quick.albedo * room.bounces.rows.matmul(light) - light
     for c in np.flatnonzero(np.diff(quick.begin) >= 4 * parts)[::5]:
         first, last = quick.begin[c], quick.begin[c + 1]
         cells = np.arange(first + part, last, parts)
@@ -286,7 +335,7 @@ def test_light_from_nothing_comes_close_in_a_trap_of_white_surfaces() -> None:
     )
     albedo = np.full((n, 3), 0.5, np.float32)
     albedo[:caught] = 1
-    bounces = Bounces(rows, albedo, rows)
+    bounces = Bounces(rows, albedo)
     tree = SimpleNamespace(n_leaves=n, weight=np.ones(n))
     begin = np.append(np.arange(0, n, caught), n)
     direct = np.zeros((n, 3), np.float32)
@@ -333,7 +382,7 @@ def _white_sheets(n_sheets: int, each: int) -> tuple[Bounces, np.ndarray]:
     indices = np.stack([np.flatnonzero((sheet == s) & (up == u)) for s, u in zip(seen, other, strict=True)])
     weights = np.full(n * each, 1 / each, np.float32)
     rows = SparseRows(np.arange(n + 1, dtype=np.int64) * each, indices.ravel().astype(np.int32), weights, n)
-    return Bounces(rows, np.ones((n, 3), np.float32), rows), np.arange(0, n + 1, 2 * each)
+    return Bounces(rows, np.ones((n, 3), np.float32)), np.arange(0, n + 1, 2 * each)
 
 
 def test_clusters_are_subtrees_that_cover_all_cells(room: Pipeline) -> None:
