@@ -26,8 +26,8 @@ def _step(first: int, last: int, indices: np.ndarray, weights: np.ndarray, impor
                 count += 1
             else:
                 others += size
-        # What is large stays so: the step shrinks as these leave the sum.
-        if count == n_large or count >= n:
+        # What is large stays so, as the step shrinks when it leaves the sum; but for rounding.
+        if count <= n_large or count >= n:
             return step
         n_large, step = count, others / (n - count)
 

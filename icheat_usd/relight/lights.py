@@ -33,8 +33,8 @@ from icheat_usd.steps import Steps
 from icheat_usd.tracing import Tracer
 from icheat_usd.transport import Bounces, CellLight, sum_lights
 
-# Light of all cells alike, beside the mean of each light that rests, that rows of bounces on the move are made for:
-# what is lit by none of them now may be once a light moves.
+# Light of all cells alike, in means of a light that rests, that rows of bounces on the move are made for: what is dark
+# now may be lit once a light moves. As much as all lights have, where these are more.
 _ALIKE = 4.0
 
 
@@ -96,7 +96,7 @@ class LiveLights:
         self.radiance: F32 = np.zeros((n, gather.n, 3), np.float32)  #: (n_lights, n_gather, 3) at gain 1
         self.view_direct: F32 = np.zeros((n, view.n, 3), np.float32)  #: (n_lights, n_view, 3) at gain 1
         self._suiting: Steps[None] | None = None  # of quick bounces to the lights, once these rest
-        self._suited = -1  # what `moves` was then
+        self._suited = False  # whether that was done since one of them changed
         for light in range(n):
             self._show(light)
 
@@ -111,8 +111,12 @@ class LiveLights:
         return tuple(light.image for light in self._lights)
 
     def take_bounces(self, bounces: Bounces) -> None:
-        """Solve the bounces of lights at rest with other rows, such as of more rays; on the move all stays as it is."""
+        """Solve the bounces of lights at rest with other rows, such as of more rays.
+
+        Lights on the move get these when all have come to rest.
+        """
         self._around.bounces = bounces
+        self._forget_suiting()
         for state in self._lights:
             if state.work is not None:
                 state.work.restart_bounces()
@@ -207,6 +211,7 @@ class LiveLights:
     def remove(self, light: int) -> None:
         """Take a light away; those behind it move up by one."""
         self._checked(light)
+        self._forget_suiting()
         self.revision += 1
         self.moves += 1
         del self._lights[light]
@@ -215,7 +220,10 @@ class LiveLights:
         self.view_direct = np.delete(self.view_direct, light, axis=0)
 
     def refine(self) -> bool:
-        """One step, some tens of milliseconds, towards the final quality of a light; False when nothing is left."""
+        """One step, some tens of milliseconds, towards the final quality of a light; False when nothing is left.
+
+        The last steps show nothing: they are for light that moves from here.
+        """
         for light, state in enumerate(self._lights):
             if state.work is not None:
                 more = state.work.step(self.radiance[light], self.view_direct[light])
@@ -229,18 +237,25 @@ class LiveLights:
 
     def _suit_bounces(self) -> bool:
         """One step of making rows of which these lights, and what is like them, has little noise; False when done."""
-        if self._suited != self.moves:
-            importance = np.full(self.radiance.shape[1], _ALIKE, np.float32)
+        if self._suited:
+            return False
+        if self._suiting is None:
+            importance = np.full(self.radiance.shape[1], max(_ALIKE, len(self._lights)), np.float32)
             for radiance in self.radiance:
-                light = radiance.mean(axis=1)
+                light = radiance[:, 0] + radiance[:, 1] + radiance[:, 2]
                 importance += light / max(light.mean(), np.finfo(np.float32).tiny)
-            self._suiting, self._suited = self._around.suit_bounces(importance), self.moves
-        if self._suiting is not None and next(self._suiting, True):
-            self._suiting = None
-        return self._suiting is not None
+            self._suiting = self._around.suit_bounces(importance)
+        if next(self._suiting, True):
+            self._suiting, self._suited = None, True
+        return not self._suited
+
+    def _forget_suiting(self) -> None:
+        """Rows are to be made anew once all lights rest; what there is of them takes memory until then."""
+        self._suiting, self._suited = None, False
 
     def stop_following(self) -> None:
         """Let go of what lights in motion are followed with, as their next move may be long in coming."""
+        self._suiting = None
         for state in self._lights:
             state.following = None
             if isinstance(state.work, (AnyLight, MovingLight)):
@@ -263,6 +278,7 @@ class LiveLights:
 
     def _show(self, light: int, known: SceneSnapshot | None = None) -> None:
         """First look; `known` is the light as it was, if what it brings is known well."""
+        self._forget_suiting()
         state = self._lights[light]
         # By name, not by number: a light keeps its random numbers when others come or go.
         seed = (self._seed + zlib.crc32(state.alone.light_paths[0].encode())) & 0x7FFFFFFF

@@ -79,6 +79,7 @@ class QuickBounces:
     blocks: NDArray[np.uint16]  #: later bounces, between clusters, per colour; see `kernels.reach_clusters`
     lasting: bool  #: whether there are enough bounces for a balance
     sent_on: float  #: factor of later bounces while light follows changes, less than 1 where errors would grow
+    most_sent_on: float  #: what it was when these clusters were made: no rows need more
     scratch: F32  #: (2, n_gather, 4) for `solve` and `follow`, which thus serve one thread at a time
     short: NDArray[np.uint64]  #: (n_gather,) as well, for light that rows reach
 
@@ -219,10 +220,14 @@ def build_quick_bounces(
         _in_blocks(matrices),
         lasting,
         1.0,
+        1.0,
         np.zeros((2, tree.n_leaves, 4), np.float32),
         np.zeros(tree.n_leaves, np.uint64),
     )
-    return all_steps(_steady(quick)) if lasting else quick
+    if not lasting:
+        return quick
+    steady = all_steps(_steady(quick))
+    return replace(steady, most_sent_on=steady.sent_on)
 
 
 def suit_to_light(quick: QuickBounces, bounces: Bounces, n_bounces: int, importance: F32) -> Steps[QuickBounces]:
@@ -265,7 +270,7 @@ def _short_entries(rows: SparseRows, column_bits: int) -> NDArray[np.uint32]:
 def _steady(quick: QuickBounces) -> Steps[QuickBounces]:
     """The same with clusters that send on less, as far as errors would else grow from frame to frame; in steps."""
     for factor in _FACTORS:
-        if factor <= quick.sent_on:
+        if factor <= quick.most_sent_on:
             tried = replace(quick, sent_on=factor)
             growth = yield from _growth(tried)
             if growth < _SHRINKS:

@@ -359,3 +359,31 @@ def test_light_that_is_moved_from_rest_bounces_with_little_noise() -> None:
     seen = [lights.revision, lights.moves]
     assert not lights.refine()
     assert [lights.revision, lights.moves] == seen
+
+
+def test_rows_for_light_on_the_move_are_made_of_more_rays_though_there_is_no_light_yet() -> None:
+    parts = Pipeline(room(), n_gather=300, bounce_rays=64)
+    lights = build(parts, n_bounces=16)
+    lights.remove(0)
+    assert not lights.paths
+    before = _entries(settle(lights))
+    lights.take_bounces(more_bounces(parts.snapshot, parts.tracer, parts.gather, parts.bounces, 64, 192))
+    assert lights.refine()
+    assert _entries(settle(lights)) > 1.1 * before
+
+
+def _entries(lights: LiveLights) -> int:
+    assert lights._around.quick_bounces is not None
+    return len(lights._around.quick_bounces.entries)
+
+
+def test_rows_that_are_being_made_are_dropped_while_nobody_looks() -> None:
+    parts = Pipeline(room(RECT), n_gather=300, bounce_rays=64)
+    lights = build(parts, n_bounces=16)
+    while lights._suiting is None:
+        assert lights.refine()
+    lights.stop_following()
+    assert lights._suiting is None
+    before = lights._around.quick_bounces
+    settle(lights)
+    assert lights._around.quick_bounces is not before

@@ -160,6 +160,17 @@ def test_rows_are_suited_in_any_number_of_steps_to_the_same(monkeypatch: pytest.
         np.testing.assert_array_equal(getattr(piecewise[-1], name), getattr(at_once[-1], name))
 
 
+def test_what_clusters_send_on_goes_by_the_rows_and_not_by_those_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    many = Pipeline(cornell(8, 8), n_gather=600, bounce_rays=512)
+    quick = build_quick_bounces(many.bounces, many.gather.tree, 16)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_SHRINKS", 0.0)
+        grows = list(_steps(quick, many, np.ones(many.gather.n, np.float32)))[-1]
+    assert grows is not None and quick.sent_on == 1 and grows.sent_on == 0
+    again = list(_steps(grows, many, np.ones(many.gather.n, np.float32)))[-1]
+    assert again is not None and again.sent_on == 1
+
+
 def _steps(quick: QuickBounces, parts: Pipeline, importance: np.ndarray) -> Iterator[QuickBounces | None]:
     yield (yield from suit_to_light(quick, parts.bounces, 16, importance))
 
