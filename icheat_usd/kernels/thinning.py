@@ -32,6 +32,23 @@ def _step(first: int, last: int, indices: np.ndarray, weights: np.ndarray, impor
         n_large, step = count, others / (n - count)
 
 
+@kernel
+def _start(row: int) -> float:
+    """Where along its steps a row begins."""
+    return ((row + 0.5) * _GOLDEN) % 1.0
+
+
+@kernel
+def _stays(size: float, step: float, along: float) -> tuple[bool, float]:
+    """Whether an entry stays, and how far along the steps the next one begins."""
+    if size < step:
+        along += size / step
+        if along < 1.0:
+            return False, along
+        along -= 1.0
+    return True, along
+
+
 @parallel_kernel
 def count_kept(
     first_row: int, indptr: np.ndarray, indices: np.ndarray, weights: np.ndarray, importance: np.ndarray, n: int,
@@ -41,15 +58,10 @@ def count_kept(
     for r in prange(len(counts)):
         first, last = indptr[r], indptr[r + 1]
         step = _step(first, last, indices, weights, importance, n)
-        along, count = ((first_row + r + 0.5) * _GOLDEN) % 1.0, 0
+        along, count = _start(first_row + r), 0
         for e in range(first, last):
-            size = np.float64(weights[e]) * importance[indices[e]]
-            if size < step:
-                along += size / step
-                if along < 1.0:
-                    continue
-                along -= 1.0
-            count += 1
+            stays, along = _stays(np.float64(weights[e]) * importance[indices[e]], step, along)
+            count += stays
         steps[r], counts[r] = step, count
 
 
@@ -69,14 +81,11 @@ def keep(
     out_indptr (n_rows + 1,) int64, out_indices (m,) int32, out_weights (m,) float32
     """
     for r in prange(len(steps)):
-        step, along, to = steps[r], ((first_row + r + 0.5) * _GOLDEN) % 1.0, out_indptr[r]
+        step, along, to = steps[r], _start(first_row + r), out_indptr[r]
         for e in range(indptr[r], indptr[r + 1]):
-            size, weight = np.float64(weights[e]) * importance[indices[e]], np.float64(weights[e])
-            if size < step:
-                along += size / step
-                if along < 1.0:
-                    continue
-                along -= 1.0
-                weight = step / importance[indices[e]]
-            out_indices[to], out_weights[to] = indices[e], weight
-            to += 1
+            size = np.float64(weights[e]) * importance[indices[e]]
+            stays, along = _stays(size, step, along)
+            if stays:
+                out_indices[to] = indices[e]
+                out_weights[to] = step / importance[indices[e]] if size < step else weights[e]
+                to += 1

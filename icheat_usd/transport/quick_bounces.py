@@ -206,7 +206,7 @@ def build_quick_bounces(
     share = (tree.weight / area[cluster]).astype(np.float32)
     factors = np.zeros((len(size), len(size)), np.float32)
     kernels.merge_rows(begin, share, cluster, rows.indptr, rows.indices, rows.weights, factors)
-    mean_albedo = np.add.reduceat(albedo * share[:, None], begin[:-1], axis=0, dtype=np.float32)
+    mean_albedo = _cluster_means(albedo, share, begin)
     sent_on = np.minimum(mean_albedo, np.float32(_SENT_ON)) if lasting else mean_albedo
     matrices = [_all_bounces(factors, channel, n_bounces - 2) for channel in sent_on.T]
     quick = QuickBounces(
@@ -257,7 +257,7 @@ def suit_to_light(quick: QuickBounces, bounces: Bounces, n_bounces: int, importa
     if not quick.lasting:
         return suited
     albedo = yield from _lasting_albedo(rows, bounces.albedo, n_bounces)
-    mean_albedo = np.add.reduceat(albedo * quick.share[:, None], quick.begin[:-1], axis=0, dtype=np.float32)
+    mean_albedo = _cluster_means(albedo, quick.share, quick.begin)
     return (yield from _steady(replace(suited, albedo=albedo, mean_albedo=mean_albedo)))
 
 
@@ -265,6 +265,11 @@ def _short_entries(rows: SparseRows, column_bits: int) -> NDArray[np.uint32]:
     entries = np.empty(rows.n_entries, np.uint32)
     kernels.shorten(rows.indices, rows.weights, column_bits, entries)
     return entries
+
+
+def _cluster_means(values: F32, share: F32, begin: I64) -> F32:
+    means: F32 = np.add.reduceat(values * share[:, None], begin[:-1], axis=0, dtype=np.float32)
+    return means
 
 
 def _steady(quick: QuickBounces) -> Steps[QuickBounces]:
