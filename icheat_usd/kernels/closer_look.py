@@ -18,6 +18,15 @@ def _level(direct: np.ndarray, cell: int) -> float:
     return np.float64(direct[cell, 0] + direct[cell, 1] + direct[cell, 2])
 
 
+@kernel
+def weighted_light(direct: np.ndarray, weight: np.ndarray) -> float:
+    """Light of all cells (n_cells, 3) by a weight of them (n_cells,), the sum of the three channels."""
+    total = 0.0
+    for cell in range(len(weight)):
+        total += np.float64(weight[cell]) * _level(direct, cell)
+    return total
+
+
 @parallel_kernel
 def noise_of_runs(direct: np.ndarray, weight: np.ndarray, begin: np.ndarray, end: np.ndarray, out: np.ndarray) -> None:
     """Squared differences of the light that runs of cells send from their weighted mean, summed.
@@ -101,3 +110,55 @@ def take_closer_looks(
                     n += 1
             share = np.float32(1.0 / n)
             direct[cell, 0], direct[cell, 1], direct[cell, 2] = r * share, g * share, b * share
+
+
+@parallel_kernel
+def shadow_noise_of_cells(
+    runs: np.ndarray, begin: np.ndarray, end: np.ndarray, cell_begin: np.ndarray, per_run: int, looked_at: np.ndarray,
+    of_patches: np.ndarray, weight: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Squared noise of the light of cells after one shadow ray of each patch point, which met something or did not.
+
+    A patch point whose ray is not blocked with a probability p has the variance p (1 - p) of its light. Of p a cell
+    knows as much as its rays say, and what its run says besides, which counts as one ray: what is used is the mean of
+    p (1 - p) over the beta distribution that this leaves. So cells all of whose rays were clear, but those beside them
+    were not, have noise, too, and where all of a run is clear there is none.
+
+    Parameters
+    ----------
+    runs, begin, end, cell_begin, per_run, looked_at, of_patches
+        As `take_closer_looks` has them.
+    weight : (n_cells,)
+    out : (n_cells,) float64, changed
+        Of the cells of `runs`: variance of the weighted sum of the three channels.
+    """
+    for i in prange(len(runs)):
+        run = np.int64(runs[i])
+        n_clear, n_rays, light = _clear_rays(run * per_run, min((run + 1) * per_run, len(of_patches)), of_patches)
+        if n_clear == 0 or n_clear == n_rays:
+            continue
+        p = n_clear / n_rays
+        for cell in range(begin[run], end[run]):
+            # A cell that the run before has a part of is that one's, if it was looked at.
+            first, last = cell_begin[cell], cell_begin[cell + 1]
+            if first < run * per_run:
+                if looked_at[run - 1] != 0:
+                    continue
+                first = run * per_run
+            if last > (run + 1) * per_run and looked_at[run + 1] == 0:
+                last = (run + 1) * per_run
+            clear, rays, level = _clear_rays(first, last, of_patches)
+            level = (level + p * (light / n_clear)) / (clear + p)
+            hidden = (clear + p) * (rays - clear + 1.0 - p) / ((rays + 1.0) * (rays + 2.0))
+            out[cell] = (weight[cell] * level) ** 2 * hidden / rays
+
+
+@kernel
+def _clear_rays(first: int, last: int, of_patches: np.ndarray) -> tuple[int, int, float]:
+    """How many patch points from one to another see light, how many there are, and what all see."""
+    n, light = 0, 0.0
+    for patch in range(first, last):
+        level = _level(of_patches, patch)
+        n += 1 if level > 0.0 else 0
+        light += level
+    return n, last - first, light

@@ -94,7 +94,7 @@ def _look_at_run(  # type: ignore[no-untyped-def]
     for j in range(min(RUN, len(row) - run * RUN)):
         if whole[j] <= 0.0:
             continue
-        of_place = hash_combine(seed, run * RUN + j)
+        of_place = hash_combine(seed, np.int64(row[run * RUN + j]))
         n = _aim(m, width, height, n_rays, of_place, columns, column[run], j, ways, weight, rows, n)
     trace_rows(
         function, 0, opaque, passing, boxes, False, columns, column, runs, ways, rays, valid, rows, n,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from icheat_usd.kernels.bsdf import LEAST_ALPHA
 from icheat_usd.kernels.clear_light import BALL
-from icheat_usd.kernels.place_columns import ALPHA, COLUMNS, RUN, SHADING, SPECULAR
+from icheat_usd.kernels.place_columns import ALPHA, COLUMNS, RUN, SHADING, SPECULAR, copy_places
 from icheat_usd.kernels.see_through import cross_layers, dim_places
 from icheat_usd.kernels.shadow import PART, SHARED_PART, STRIDE, TURNED, light_places, tell_points
 from icheat_usd.kernels.shaping import shape_places
@@ -190,6 +190,16 @@ def prepare_places(
     column = np.zeros((len(surface), COLUMNS), np.int32)
     column[:, :SPECULAR], column[lobes, SPECULAR:] = of_surface, of_lobe
     return Places(row, points.instance, _bounds(surface[:, :SHADING]), columns, column, lobes)
+
+
+def diffuse_places(places: Places, which: I64) -> Places:
+    """Some of the places (n,), in runs of their own, but without their lobes; rows stay those of the same points."""
+    surface = _in_lines((-(-len(which) // RUN) * SPECULAR, RUN)).reshape(-1, SPECULAR, RUN)
+    copy_places(*places.table, which, surface)
+    column = np.zeros((len(surface), COLUMNS), np.int32)
+    column[:, :SPECULAR] = np.arange(len(surface) * SPECULAR).reshape(-1, SPECULAR)
+    lobes, bounds = np.zeros(len(surface), np.bool_), _bounds(surface[:, :SHADING])
+    return Places(places.row[which], places.instance, bounds, surface.reshape(-1, RUN), column, lobes)
 
 
 def _share_columns(tables: Sequence[F32]) -> tuple[F32, list[I32]]:

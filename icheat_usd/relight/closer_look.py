@@ -5,11 +5,19 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from icheat_usd.kernels.closer_look import add_changes_of_runs, copy_runs, noise_of_runs, take_closer_looks
+from icheat_usd.kernels.closer_look import (
+    add_changes_of_runs,
+    copy_runs,
+    noise_of_runs,
+    shadow_noise_of_cells,
+    take_closer_looks,
+    weighted_light,
+)
 from icheat_usd.kernels.place_columns import RUN
+from icheat_usd.kernels.rows import mean_over_segments
 from icheat_usd.kernels.workers import take_back
 from icheat_usd.lighting.even import can_look_evenly, look_evenly
-from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, direct_at
+from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, diffuse_places, direct_at
 from icheat_usd.samples import GatherSamples
 from icheat_usd.scene import F32, F64, I32, I64, SceneSnapshot
 
@@ -20,12 +28,14 @@ MOST_RUNS = 256
 MOST_RUNS_OF_SUN = 1536
 #: Of suns, noise of so many runs next to each counts for it, so much of their mean.
 N_BESIDE, BESIDE = 7, 0.1
-#: Of these, the noisiest, such as those next to a small light, are looked at so many times; at a rectangle by so many
-#: rays spread over what they see of it.
-WORST_RUNS, TURNS = 16, 4
+#: Cells that something may hide a part of the light from, and that have most of the noise then, such as those next to a
+#: small light, are looked at so many times; at a rectangle by so many rays spread over what they see of it.
+WORST_CELLS, TURNS = 384, 2
 #: Noise of all cells, beside all light of theirs, below which no run is worth a look; and what looks may leave of more.
 #: Light that lies on many cells averages: at .0015 an image was .4 % off, at .0065, from a sun in a window, 22 %.
 LITTLE_NOISE, LEFT_NOISE, LEFT_NOISE_OF_SUN = 2e-3, 5e-4, 2e-4
+#: What looks at the worst cells may leave of it, by what the view gets from each.
+LEFT_NOISE_OF_SHADOWS = 1e-4
 
 
 class CloserLook:
@@ -48,6 +58,7 @@ class CloserLook:
         self._last = LastLook(patches)
         self._looked_at = np.zeros(len(first), np.uint8)
         self._found: F32 = np.empty((patches.n, 3), np.float32)
+        self._noise_of_cells = np.zeros(gather.n)
         self._known: F32 | None = None  # of all cells, from when each was looked at closely for the last time
 
     def know(self, direct: F32) -> None:
@@ -88,26 +99,37 @@ class CloserLook:
         self._take(runs, direct)
         take_back()
         # Few cells next to a light, from which the view gets much, may have most of what is wrong in an image.
-        weight = self._gather.area if shining.distant else self._gather.importance
-        worst = self._worst_runs(direct, runs, weight)
+        worst = self._worst_cells(direct, runs, self._gather.area if shining.distant else self._gather.importance)
         if len(worst):
-            self._look_again(alone, shadows, seed, shining, worst)
-            self._take(worst, direct)
+            self._look_again(alone, shadows, seed, shining, worst, direct)
         if shining.distant and self._known is not None:
             copy_runs(runs, self._begin, self._end, direct, self._known)
 
-    def _look_again(self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, runs: I32) -> None:
-        """Make of what is found at the patch points of some runs what `TURNS` rays of each say."""
+    def _look_again(
+        self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, cells: I64, direct: F32
+    ) -> None:
+        """Make the light of some cells what `TURNS` rays say of each patch point that was looked at."""
+        begin, size = self._gather.cell_begin[cells], np.diff(self._gather.cell_begin)[cells]
+        ends = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+        which = np.repeat(begin - ends[:-1], size) + np.arange(ends[-1])
+        # Of a cell between two runs one part may not have been looked at, of which nothing is known.
+        is_known = self._looked_at[which // RUN] != 0
+        ends = np.concatenate([[0], np.cumsum(np.add.reduceat(is_known, ends[:-1], dtype=np.int64))])
+        which = which[is_known]
+        places = diffuse_places(self._patches, which)
         if can_look_evenly(alone, shining):
-            look_evenly(alone, shadows, self._patches, shining, seed, TURNS, runs, self._found)
-            return
-        places = (runs[:, None] * RUN + np.arange(RUN)).ravel()
-        places = places[places < self._patches.n]
-        total, more = self._found[places], np.empty_like(self._found)
-        for turn in range(1, TURNS):
-            direct_at(alone, shadows, self._patches, seed, False, more, turn, None, shining, runs)
-            total += more[places]
-        self._found[places] = total / np.float32(TURNS)
+            every = np.arange(places.n_runs, dtype=np.int32)
+            look_evenly(alone, shadows, places, shining, seed, TURNS, every, self._found)
+            found = self._found[which]
+        else:
+            found = np.zeros((places.n, 3), np.float32)
+            for turn in range(TURNS):
+                direct_at(alone, shadows, places, seed, False, self._found, turn, None, shining)
+                found += self._found[which]
+            found /= np.float32(TURNS)
+        means = np.empty((len(cells), 3), np.float32)
+        mean_over_segments(ends, found, means)
+        direct[cells] = means
 
     def _noise(self, direct: F32, weight: F32) -> tuple[F64, float]:
         """Squared noise of each run, and the light of all, by a weight of cells (n_cells,)."""
@@ -137,12 +159,16 @@ class CloserLook:
         noise += BESIDE * noise[self._beside].mean(axis=1)
         return np.sort(_worth_a_look(noise, MOST_RUNS_OF_SUN, light, LEFT_NOISE_OF_SUN)).astype(np.int32)
 
-    def _worst_runs(self, direct: F32, runs: I32, weight: F32) -> I32:
-        """Those of some runs that are still noisy by a weight of cells, ascending; none if that does not matter."""
-        noise, light = self._noise(direct, weight)
-        noise = noise[runs]
-        worst = np.sort(runs[_largest(noise, WORST_RUNS)])
-        return worst if noise.sum() > (LEFT_NOISE * light) ** 2 else worst[:0]
+    def _worst_cells(self, direct: F32, runs: I32, weight: F32) -> I64:
+        """Cells of some runs, just looked at, that still have noise of shadows by a weight of cells, ascending."""
+        noise = self._noise_of_cells
+        noise[:] = 0.0
+        shadow_noise_of_cells(
+            runs, self._begin, self._end, self._gather.cell_begin, RUN, self._looked_at, self._found, weight, noise
+        )
+        light = weighted_light(direct, weight)
+        noisy = np.flatnonzero(noise)
+        return np.sort(noisy[_largest_but(noise[noisy], WORST_CELLS, (LEFT_NOISE_OF_SHADOWS * light) ** 2)])
 
     def _take(self, runs: I32, direct: F32) -> None:
         cells = self._begin, self._end, self._gather.cell_begin
@@ -165,12 +191,12 @@ def _worth_a_look(noise: F64, n: int, light: float, left_noise: float) -> I64:
     """At most `n` runs that are the noisiest, so that what others have does not matter beside the light of all."""
     if noise.sum() <= (LITTLE_NOISE * light) ** 2:
         return np.empty(0, np.int64)
-    most = _largest(noise, n)
-    left = noise.sum() - np.cumsum(noise[most])
-    return most[: 1 + np.searchsorted(-left, -((left_noise * light) ** 2))]
+    return _largest_but(noise, n, (left_noise * light) ** 2)
 
 
-def _largest(values: F64, n: int) -> I64:
-    """Numbers of the `n` largest values, largest first."""
+def _largest_but(values: F64, n: int, left: float) -> I64:
+    """Numbers of at most `n` of the largest values, largest first, so that all others are `left` together or less."""
     most = np.argpartition(-values, n)[:n] if len(values) > n else np.arange(len(values))
-    return most[np.argsort(-values[most], kind="stable")]
+    most = most[np.argsort(-values[most], kind="stable")]
+    others = np.concatenate([[values.sum()], values.sum() - np.cumsum(values[most])])
+    return most[: np.searchsorted(-others, -left)]

@@ -7,7 +7,7 @@ import pytest
 
 from icheat_usd.lighting import build_light_sampler, irradiance
 from icheat_usd.lighting.even import can_look_evenly, look_evenly
-from icheat_usd.lighting.quick import build_shadows, direct_at, prepare_places, shining_points
+from icheat_usd.lighting.quick import build_shadows, diffuse_places, direct_at, prepare_places, shining_points
 from icheat_usd.materials import take_points
 from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
 from tests.lighting.test_quick import LIGHTS, on_floor, tracer_of
@@ -88,6 +88,22 @@ def test_places_behind_glass_keep_what_they_have() -> None:
     open_share = expected(opaque, points, 256)[:, 0] / expected(room(LIGHTS["rect"]), points, 256)[:, 0]
     assert kept[open_share < 0.1].all() and not kept[open_share == 1.0].any()
     assert np.count_nonzero(kept) > 20
+
+
+def test_some_of_the_places_see_what_they_see_among_all() -> None:
+    snapshot = room(LONG, Mesh(SCREEN, Material(0.5)))
+    points = on_floor(snapshot, 500)
+    places = prepare_places(snapshot, points, points.albedo, None)
+    which = np.random.default_rng(8).choice(500, 200, replace=False)
+    some = diffuse_places(places, which)
+    assert some.n == 200 and some.n_runs == 4
+    found = np.zeros((500, 3), np.float32)
+    shadows, shining = build_shadows(snapshot, tracer_of(snapshot)), shining_points(snapshot, 7, by_form=True)
+    look_evenly(snapshot, shadows, some, shining, 5, 4, np.arange(4, dtype=np.int32), found)
+    among_all = even(snapshot, points, 5, 4)
+    # What all of the light brings is rounded otherwise beside other places.
+    np.testing.assert_allclose(found[which], among_all[which], rtol=1e-3)
+    assert not np.delete(found, which, axis=0).any() and np.count_nonzero(among_all[which]) > 150
 
 
 def test_other_lights_are_not_looked_at_so() -> None:

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from icheat_usd.kernels.closer_look import add_changes_of_runs, copy_runs, noise_of_runs, take_closer_looks
+from icheat_usd.kernels.closer_look import (
+    add_changes_of_runs,
+    copy_runs,
+    noise_of_runs,
+    shadow_noise_of_cells,
+    take_closer_looks,
+    weighted_light,
+)
 from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.relight import closer_look
 from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside
 from icheat_usd.relight.lights import LiveLights
-from icheat_usd.scene import F32, LightKind, SceneSnapshot
+from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot
 from tests.pipeline import Pipeline
 from tests.scenes import Light, cornell_meshes, look_at, make_snapshot, rotation, translation
 
@@ -134,11 +142,77 @@ def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
     even = np.ones((pipeline.gather.n, 3), np.float32)
     assert len(look._noisy_runs(even)) == len(look._border_runs(even)) == 0
-    assert len(look._worst_runs(even, np.arange(4, dtype=np.int32), pipeline.gather.importance)) == 0
+    look._looked_at[:4], look._found[:] = 1, 1.0
+    assert len(look._worst_cells(even, np.arange(4, dtype=np.int32), pipeline.gather.importance)) == 0
+    look._found[::3] = 0.0
+    assert len(look._worst_cells(even, np.arange(4, dtype=np.int32), pipeline.gather.importance)) > 4
     monkeypatch.setattr(closer_look, "MOST_RUNS", 2)
     spotted = even.copy()
     spotted[::50] = 9.0
     assert 2 < len(look._noisy_runs(spotted)) <= 6
+
+
+def test_cells_in_part_of_whose_light_something_stands_are_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = Pipeline(room(GRAZING), n_gather=2048)
+    importance = pipeline.gather.importance
+    errors: dict[int, list[float]] = {0: [], closer_look.WORST_CELLS: []}
+    for seed in range(4):
+        for n_cells, found in errors.items():
+            monkeypatch.setattr(closer_look, "WORST_CELLS", n_cells)
+            lights = first_look(pipeline, seed)
+            direct = lights._lights[0].direct.copy()
+            while lights.refine():
+                pass
+            found.append(error(direct, lights._lights[0].direct, importance))
+    without, with_them = map(np.mean, errors.values())
+    assert with_them < 0.4 * without
+
+
+def cells_in_runs(rng: np.random.Generator) -> tuple[I64, I64, I64, int]:
+    """First patch point of each of 40 cells, first and last cell of each run, patch points of a run."""
+    per_run = 16
+    cell_begin = np.concatenate([[0], np.cumsum(rng.integers(1, 9, 40))]).astype(np.int64)
+    first = np.arange(0, cell_begin[-1], per_run)
+    begin = np.searchsorted(cell_begin, first, side="right") - 1
+    end = np.searchsorted(cell_begin, np.minimum(first + per_run, cell_begin[-1]) - 1, side="right")
+    return cell_begin, begin, end, per_run
+
+
+def test_noise_of_shadows_is_that_of_a_plain_loop() -> None:
+    """The mean of p (1 - p) over a beta distribution; of cells between two runs what was looked at counts."""
+    rng = np.random.default_rng(6)
+    cell_begin, begin, end, per_run = cells_in_runs(rng)
+    n = int(cell_begin[-1])
+    of_patches = rng.random((n, 3)).astype(np.float32)
+    of_patches[rng.random(n) < 0.4] = 0.0
+    runs = np.array([1, 2, 5, 6, len(begin) - 1], np.int32)
+    of_patches[5 * per_run : 6 * per_run] = 1.0  # all of a run in sight: no noise
+    looked_at = np.zeros(len(begin), np.uint8)
+    looked_at[runs] = 1
+    weight, found = rng.random(40).astype(np.float32), np.zeros(40)
+    shadow_noise_of_cells(runs, begin, end, cell_begin, per_run, looked_at, of_patches, weight, found)
+    for cell in range(40):
+        mine = np.arange(cell_begin[cell], cell_begin[cell + 1])
+        mine = mine[looked_at[mine // per_run] > 0]
+        expected = 0.0
+        if len(mine):
+            level = of_patches.sum(axis=1, dtype=np.float64)
+            of_run = level[mine[0] // per_run * per_run :][:per_run]
+            share = np.mean(of_run > 0)
+            clear, rays = np.count_nonzero(level[mine]), len(mine)
+            a, b = clear + share, rays - clear + 1 - share
+            if 0 < share < 1:
+                light = (level[mine].sum() + share * of_run[of_run > 0].mean()) / (clear + share)
+                expected = (weight[cell] * light) ** 2 * stats.beta(a, b).expect(lambda p: p * (1 - p)) / rays
+        np.testing.assert_allclose(found[cell], expected, rtol=1e-5, atol=1e-12)
+    assert np.count_nonzero(found) > 8
+
+
+def test_light_of_all_cells_is_their_weighted_sum() -> None:
+    rng = np.random.default_rng(7)
+    direct, weight = rng.random((50, 3)).astype(np.float32), rng.random(50).astype(np.float32)
+    expected = (weight[:, None].astype(np.float64) * direct).sum()
+    np.testing.assert_allclose(weighted_light(direct, weight), expected, rtol=1e-6)
 
 
 def test_noise_of_runs_is_that_of_a_plain_loop() -> None:
@@ -190,15 +264,11 @@ def test_where_there_are_few_runs_each_is_beside_itself() -> None:
 def test_cells_get_the_mean_of_what_was_looked_at() -> None:
     """Cells of runs that were looked at, of a cell between two runs the part that was; all others stay."""
     rng = np.random.default_rng(2)
-    count = rng.integers(1, 9, 40)
-    cell_begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-    n, per_run = int(cell_begin[-1]), 16
+    cell_begin, begin, end, per_run = cells_in_runs(rng)
+    n = int(cell_begin[-1])
     of_patches = rng.random((n, 3)).astype(np.float32)
-    first = np.arange(0, n, per_run)
-    begin = np.searchsorted(cell_begin, first, side="right") - 1
-    end = np.searchsorted(cell_begin, np.minimum(first + per_run, n) - 1, side="right")
     runs = np.array([1, 2, 5], np.int32)
-    looked_at = np.zeros(len(first), np.uint8)
+    looked_at = np.zeros(len(begin), np.uint8)
     looked_at[runs] = 1
     direct = np.full((40, 3), -1, np.float32)
     take_closer_looks(runs, begin, end, cell_begin, per_run, looked_at, of_patches, direct)
