@@ -109,7 +109,8 @@ class CloserLook:
         self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, cells: I64, direct: F32
     ) -> None:
         """Make the light of some cells what `TURNS` rays say of each patch point that was looked at."""
-        begin, size = self._gather.cell_begin[cells], np.diff(self._gather.cell_begin)[cells]
+        begin, end = self._gather.cell_begin[cells], self._gather.cell_begin[cells + 1]
+        size = end - begin
         ends = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
         which = np.repeat(begin - ends[:-1], size) + np.arange(ends[-1])
         # Of a cell between two runs one part may not have been looked at, of which nothing is known.
@@ -167,7 +168,7 @@ class CloserLook:
             runs, self._begin, self._end, self._gather.cell_begin, RUN, self._looked_at, self._found, weight, noise
         )
         light = weighted_light(direct, weight)
-        noisy = np.flatnonzero(noise)
+        noisy = np.flatnonzero(noise > 0.0)
         return np.sort(noisy[_largest_but(noise[noisy], WORST_CELLS, (LEFT_NOISE_OF_SHADOWS * light) ** 2)])
 
     def _take(self, runs: I32, direct: F32) -> None:
