@@ -122,12 +122,13 @@ def shadow_noise_of_cells(
     A patch point whose ray is not blocked with a probability p has the variance p (1 - p) of its light. Of p a cell
     knows as much as its rays say, and what its run says besides, which counts as one ray: what is used is the mean of
     p (1 - p) over the beta distribution that this leaves. So cells all of whose rays were clear, but those beside them
-    were not, have noise, too, and where all of a run is clear there is none.
+    were not, have noise, too, and where all of a run is clear there is none. Points that get no light whatever rays
+    say, as those that face away, count as hidden: it is too much noise that cells which have some get.
 
     Parameters
     ----------
     runs, begin, end, cell_begin, per_run, looked_at, of_patches
-        As `take_closer_looks` has them.
+        As `take_closer_looks` has them; no cell has as many patch points as a run.
     weight : (n_cells,)
     out : (n_cells,) float64, changed
         Of the cells of `runs`: variance of the weighted sum of the three channels.
@@ -135,9 +136,7 @@ def shadow_noise_of_cells(
     for i in prange(len(runs)):
         run = np.int64(runs[i])
         n_clear, n_rays, light = _clear_rays(run * per_run, min((run + 1) * per_run, len(of_patches)), of_patches)
-        if n_clear == 0 or n_clear == n_rays:
-            continue
-        p = n_clear / n_rays
+        p, mean = n_clear / n_rays, light / max(n_clear, 1)
         for cell in range(begin[run], end[run]):
             # A cell that the run before has a part of is that one's, if it was looked at.
             first, last = cell_begin[cell], cell_begin[cell + 1]
@@ -148,9 +147,10 @@ def shadow_noise_of_cells(
             if last > (run + 1) * per_run and looked_at[run + 1] == 0:
                 last = (run + 1) * per_run
             clear, rays, level = _clear_rays(first, last, of_patches)
-            level = (level + p * (light / n_clear)) / (clear + p)
-            hidden = (clear + p) * (rays - clear + 1.0 - p) / ((rays + 1.0) * (rays + 2.0))
-            out[cell] = (weight[cell] * level) ** 2 * hidden / rays
+            if clear + p > 0.0:
+                level = (level + p * mean) / (clear + p)
+                hidden = (clear + p) * (rays - clear + 1.0 - p) / ((rays + 1.0) * (rays + 2.0))
+                out[cell] = (weight[cell] * level) ** 2 * hidden / rays
 
 
 @kernel

@@ -28,9 +28,10 @@ MOST_RUNS = 256
 MOST_RUNS_OF_SUN = 1536
 #: Of suns, noise of so many runs next to each counts for it, so much of their mean.
 N_BESIDE, BESIDE = 7, 0.1
-#: Cells that something may hide a part of the light from, and that have most of the noise then, such as those next to a
-#: small light, are looked at so many times; at a rectangle by so many rays spread over what they see of it.
-WORST_CELLS, TURNS = 384, 2
+#: Of these, the runs with most noise of shadows, such as those next to a small light, are looked at so many times.
+WORST_RUNS, TURNS = 16, 4
+#: At a rectangle so many cells are instead, by so many rays of each patch point, spread over what that sees of it.
+WORST_CELLS, N_EVEN = 384, 2
 #: Noise of all cells, beside all light of theirs, below which no run is worth a look; and what looks may leave of more.
 #: Light that lies on many cells averages: at .0015 an image was .4 % off, at .0065, from a sun in a window, 22 %.
 LITTLE_NOISE, LEFT_NOISE, LEFT_NOISE_OF_SUN = 2e-3, 5e-4, 2e-4
@@ -58,7 +59,7 @@ class CloserLook:
         self._last = LastLook(patches)
         self._looked_at = np.zeros(len(first), np.uint8)
         self._found: F32 = np.empty((patches.n, 3), np.float32)
-        self._noise_of_cells = np.zeros(gather.n)
+        self._noise_of_cells, self._run_of_cell = np.zeros(gather.n), gather.cell_begin[:-1] // RUN
         self._known: F32 | None = None  # of all cells, from when each was looked at closely for the last time
 
     def know(self, direct: F32) -> None:
@@ -99,16 +100,26 @@ class CloserLook:
         self._take(runs, direct)
         take_back()
         # Few cells next to a light, from which the view gets much, may have most of what is wrong in an image.
-        worst = self._worst_cells(direct, runs, self._gather.area if shining.distant else self._gather.importance)
-        if len(worst):
-            self._look_again(alone, shadows, seed, shining, worst, direct)
+        noise, left = self._noise_of_shadows(
+            direct, runs, self._gather.area if shining.distant else self._gather.importance
+        )
+        if can_look_evenly(alone, shining):
+            self._look_evenly(alone, shadows, seed, shining, _largest_but(noise, WORST_CELLS, left), direct)
+        else:
+            of_runs = np.bincount(self._run_of_cell, weights=noise, minlength=len(self._begin))
+            worst = np.sort(runs[_largest_but(of_runs[runs], WORST_RUNS, left)])
+            self._look_again(alone, shadows, seed, shining, worst)
+            self._take(worst, direct)
         if shining.distant and self._known is not None:
             copy_runs(runs, self._begin, self._end, direct, self._known)
 
-    def _look_again(
+    def _look_evenly(
         self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, cells: I64, direct: F32
     ) -> None:
-        """Make the light of some cells what `TURNS` rays say of each patch point that was looked at."""
+        """Make the light of some cells what `N_EVEN` rays say of each patch point that was looked at."""
+        if not len(cells):
+            return
+        cells = np.sort(cells)
         begin, end = self._gather.cell_begin[cells], self._gather.cell_begin[cells + 1]
         size = end - begin
         ends = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
@@ -118,19 +129,23 @@ class CloserLook:
         ends = np.concatenate([[0], np.cumsum(np.add.reduceat(is_known, ends[:-1], dtype=np.int64))])
         which = which[is_known]
         places = diffuse_places(self._patches, which)
-        if can_look_evenly(alone, shining):
-            every = np.arange(places.n_runs, dtype=np.int32)
-            look_evenly(alone, shadows, places, shining, seed, TURNS, every, self._found)
-            found = self._found[which]
-        else:
-            found = np.zeros((places.n, 3), np.float32)
-            for turn in range(TURNS):
-                direct_at(alone, shadows, places, seed, False, self._found, turn, None, shining)
-                found += self._found[which]
-            found /= np.float32(TURNS)
+        every = np.arange(places.n_runs, dtype=np.int32)
+        look_evenly(alone, shadows, places, shining, seed, N_EVEN, every, self._found)
         means = np.empty((len(cells), 3), np.float32)
-        mean_over_segments(ends, found, means)
+        mean_over_segments(ends, self._found[which], means)
         direct[cells] = means
+
+    def _look_again(self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, runs: I32) -> None:
+        """Make of what is found at the patch points of some runs what `TURNS` looks at each say."""
+        if not len(runs):
+            return
+        places = (runs[:, None] * RUN + np.arange(RUN)).ravel()
+        places = places[places < self._patches.n]
+        total, more = self._found[places], np.empty_like(self._found)
+        for turn in range(1, TURNS):
+            direct_at(alone, shadows, self._patches, seed, False, more, turn, None, shining, runs)
+            total += more[places]
+        self._found[places] = total / np.float32(TURNS)
 
     def _noise(self, direct: F32, weight: F32) -> tuple[F64, float]:
         """Squared noise of each run, and the light of all, by a weight of cells (n_cells,)."""
@@ -160,16 +175,17 @@ class CloserLook:
         noise += BESIDE * noise[self._beside].mean(axis=1)
         return np.sort(_worth_a_look(noise, MOST_RUNS_OF_SUN, light, LEFT_NOISE_OF_SUN)).astype(np.int32)
 
-    def _worst_cells(self, direct: F32, runs: I32, weight: F32) -> I64:
-        """Cells of some runs, just looked at, that still have noise of shadows by a weight of cells, ascending."""
+    def _noise_of_shadows(self, direct: F32, runs: I32, weight: F32) -> tuple[F64, float]:
+        """Squared noise (n_cells,) of shadows in cells of some runs, just looked at; and what may be left of it.
+
+        Both by a weight of cells (n_cells,).
+        """
         noise = self._noise_of_cells
         noise[:] = 0.0
         shadow_noise_of_cells(
             runs, self._begin, self._end, self._gather.cell_begin, RUN, self._looked_at, self._found, weight, noise
         )
-        light = weighted_light(direct, weight)
-        noisy = np.flatnonzero(noise > 0.0)
-        return np.sort(noisy[_largest_but(noise[noisy], WORST_CELLS, (LEFT_NOISE_OF_SHADOWS * light) ** 2)])
+        return noise, (LEFT_NOISE_OF_SHADOWS * weighted_light(direct, weight)) ** 2
 
     def _take(self, runs: I32, direct: F32) -> None:
         cells = self._begin, self._end, self._gather.cell_begin
@@ -197,7 +213,9 @@ def _worth_a_look(noise: F64, n: int, light: float, left_noise: float) -> I64:
 
 def _largest_but(values: F64, n: int, left: float) -> I64:
     """Numbers of at most `n` of the largest values, largest first, so that all others are `left` together or less."""
-    most = np.argpartition(-values, n)[:n] if len(values) > n else np.arange(len(values))
+    most = np.flatnonzero(values > 0.0)
+    if len(most) > n:
+        most = most[np.argpartition(-values[most], n)[:n]]
     most = most[np.argsort(-values[most], kind="stable")]
     others = np.concatenate([[values.sum()], values.sum() - np.cumsum(values[most])])
     return most[: np.searchsorted(-others, -left)]
