@@ -106,7 +106,7 @@ class CloserLook:
         if can_look_evenly(alone, shining):
             self._look_evenly(alone, shadows, seed, shining, _largest_but(noise, WORST_CELLS, left), direct)
         else:
-            of_runs = np.bincount(self._run_of_cell, weights=noise, minlength=len(self._begin))
+            of_runs = np.bincount(self._run_of_cell, noise, len(self._begin)).astype(np.float64)
             worst = np.sort(runs[_largest_but(of_runs[runs], WORST_RUNS, left)])
             self._look_again(alone, shadows, seed, shining, worst)
             self._take(worst, direct)

@@ -156,7 +156,7 @@ def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 2 < len(look._noisy_runs(spotted)) <= 6
 
 
-@pytest.mark.parametrize(("light", "limit", "part"), [(GRAZING, "WORST_CELLS", 0.4), (SUNK, "WORST_RUNS", 0.6)])
+@pytest.mark.parametrize(("light", "limit", "part"), [(GRAZING, "WORST_CELLS", 0.4), (SUNK, "WORST_RUNS", 0.8)])
 def test_cells_in_part_of_whose_light_something_stands_are_looked_at_again(
     light: Light, limit: str, part: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
