@@ -31,7 +31,7 @@ N_BESIDE, BESIDE = 7, 0.1
 #: Of these, the runs with most noise of shadows, such as those next to a small light, are looked at so many times.
 WORST_RUNS, TURNS = 16, 4
 #: At a rectangle so many cells are instead, by so many rays of each patch point, spread over what that sees of it.
-WORST_CELLS, N_EVEN = 384, 2
+WORST_CELLS, N_EVEN = 256, 4
 #: Noise of all cells, beside all light of theirs, below which no run is worth a look; and what looks may leave of more.
 #: Light that lies on many cells averages: at .0015 an image was .4 % off, at .0065, from a sun in a window, 22 %.
 LITTLE_NOISE, LEFT_NOISE, LEFT_NOISE_OF_SUN = 2e-3, 5e-4, 2e-4

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from icheat_usd.relight import closer_look
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.session.frames import array_bytes
@@ -40,6 +41,12 @@ def room(light: Light) -> SceneSnapshot:
     block = Mesh(box(0.35, (0.2, -0.3, 0.1)), Material(0.7), path="/block")
     camera = look_at((0, 0, 3.9), fov=39.3, width=96, height=72)
     return make_snapshot([*cornell_meshes(), block], lights=[light], camera=camera)
+
+
+@pytest.fixture(autouse=True)
+def _cells_are_not_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What leaves less noise of a first look leaves less to be known of it."""
+    monkeypatch.setattr(closer_look, "WORST_CELLS", 0)
 
 
 @pytest.fixture(scope="module")
@@ -182,3 +189,14 @@ def test_a_light_that_is_not_followed_takes_less_memory_and_goes_on(scene: Pipel
     # Nothing is known of its noise now.
     np.testing.assert_array_equal(looks[1], looks[2])
     assert not np.array_equal(looks[0], looks[2])
+
+
+def test_what_is_known_takes_noise_that_second_looks_leave(scene: Pipeline, monkeypatch: pytest.MonkeyPatch):
+    """Neither does without the other: of the light at the cells, both together leave the least."""
+    true = settle(build(scene, rect(0.0)))
+    errors = {}
+    for n_cells in (0, 256):
+        monkeypatch.setattr(closer_look, "WORST_CELLS", n_cells)
+        for rests in (True, False):
+            errors[n_cells, rests] = off(scene, dragged(scene, rect, [0.01, 0.03, 0.0], rests), true)[1]
+    assert errors[256, True] < 0.8 * min(errors[0, True], errors[256, False])
