@@ -120,10 +120,7 @@ class CloserLook:
         if not len(cells):
             return
         cells = np.sort(cells)
-        begin, end = self._gather.cell_begin[cells], self._gather.cell_begin[cells + 1]
-        size = end - begin
-        ends = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
-        which = np.repeat(begin - ends[:-1], size) + np.arange(ends[-1])
+        which, ends = self._gather.patches_of(cells)
         # Of a cell between two runs one part may not have been looked at, of which nothing is known.
         is_known = self._looked_at[which // RUN] != 0
         ends = np.concatenate([[0], np.cumsum(np.add.reduceat(is_known, ends[:-1], dtype=np.int64))])

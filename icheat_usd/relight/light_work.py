@@ -192,9 +192,7 @@ class Surroundings:
 
     def lit_cells(self, alone: SceneSnapshot, sampler: LightSampler, cells: I64, seed: int, n: int) -> F32:
         """What some cells (m,) reflect of the light of a one-light snapshot, `n` shadow rays a patch point: (m, 3)."""
-        begin, size = self.gather.cell_begin[cells], np.diff(self.gather.cell_begin)[cells]
-        ends = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
-        patches = np.repeat(begin - ends[:-1], size) + np.arange(ends[-1])
+        patches, ends = self.gather.patches_of(cells)
         points = take_points(self.gather.patch_points, patches)
         arriving = irradiance(alone, self.tracer, sampler, points, seed, n)[0]
         means = np.empty((len(cells), 3), np.float32)

@@ -67,6 +67,13 @@ class GatherSamples:
         """Cell of each point; -1 where a point is no hit (``instance == -1``)."""
         return self.locator.locate(points.position, points.normal, points.instance, points.side)
 
+    def patches_of(self, cells: I64) -> tuple[I64, I64]:
+        """Patch points of some cells (m,), one cell after the other, and where each begins among them (m + 1,)."""
+        begin = self.cell_begin[cells]
+        size = self.cell_begin[cells + 1] - begin
+        ends = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+        return np.repeat(begin - ends[:-1], size) + np.arange(ends[-1]), ends
+
 
 @dataclass(frozen=True)
 class _Slots:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from icheat_usd.relight import closer_look
+from icheat_usd.relight.closer_look import WORST_CELLS
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.session.frames import array_bytes
@@ -195,8 +196,8 @@ def test_what_is_known_takes_noise_that_second_looks_leave(scene: Pipeline, monk
     """Neither does without the other: of the light at the cells, both together leave the least."""
     true = settle(build(scene, rect(0.0)))
     errors = {}
-    for n_cells in (0, 256):
+    for n_cells in (0, WORST_CELLS):
         monkeypatch.setattr(closer_look, "WORST_CELLS", n_cells)
         for rests in (True, False):
             errors[n_cells, rests] = off(scene, dragged(scene, rect, [0.01, 0.03, 0.0], rests), true)[1]
-    assert errors[256, True] < 0.8 * min(errors[0, True], errors[256, False])
+    assert errors[WORST_CELLS, True] < 0.8 * min(errors[0, True], errors[WORST_CELLS, False])

@@ -148,6 +148,15 @@ def test_patch_points_lie_in_their_cells_and_every_cell_has_some() -> None:
     assert np.array_equal(np.repeat(np.arange(gather.n), np.diff(gather.cell_begin)), gather.patch_cell)
 
 
+def test_patch_points_of_some_cells_come_one_cell_after_the_other() -> None:
+    gather = gather_of(meadow(), 60)
+    cells = np.array([7, 3, 41])
+    patches, ends = gather.patches_of(cells)
+    for cell, first, last in zip(cells, ends[:-1], ends[1:], strict=True):
+        np.testing.assert_array_equal(patches[first:last], np.flatnonzero(gather.patch_cell == cell))
+    assert ends[0] == 0 and ends[-1] == len(patches)
+
+
 def test_samples_on_a_surface_are_uniform_in_area() -> None:
     fan = [[[0, 0, 0], [0, 0, 1], [0.1 * (k + 1) ** 2, 0, 0.5]] for k in range(5)]
     scene = make_snapshot([Mesh(np.array(fan, np.float32))], camera=look_at((1, 3, 1)))
