@@ -115,28 +115,33 @@ def take_closer_looks(
 @parallel_kernel
 def shadow_noise_of_cells(
     runs: np.ndarray, begin: np.ndarray, end: np.ndarray, cell_begin: np.ndarray, per_run: int, looked_at: np.ndarray,
-    of_patches: np.ndarray, weight: np.ndarray, out: np.ndarray,
+    of_patches: np.ndarray, whole: np.ndarray, weight: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Squared noise of the light of cells after one shadow ray of each patch point, which met something or did not.
 
-    A patch point whose ray is not blocked with a probability p has the variance p (1 - p) of its light. Of p a cell
-    knows as much as its rays say, and what its run says besides, which counts as one ray: what is used is the mean of
-    p (1 - p) over the beta distribution that this leaves. So cells all of whose rays were clear, but those beside them
-    were not, have noise, too, and where all of a run is clear there is none. Points that get no light whatever rays
-    say, as those that face away, count as hidden: it is too much noise that cells which have some get.
+    A patch point whose ray is not blocked with a probability p has the variance p (1 - p) of the light that it gets
+    if nothing is in the way. Of p a cell knows as much as its rays say, and what its run says besides, which counts as
+    one ray: what is used is the mean of p (1 - p) over the beta distribution that this leaves. So cells all of whose
+    rays were clear, but those beside them were not, have noise, too. A run has half a ray of either kind besides its
+    own, for a shadow that no ray has met.
 
     Parameters
     ----------
     runs, begin, end, cell_begin, per_run, looked_at, of_patches
         As `take_closer_looks` has them; no cell has as many patch points as a run.
+    whole : (n_patches,) float32
+        What each patch point of `runs` reflects of the light if nothing hides it, the sum of the channels; 0 where
+        that is not known. Those that get no light either way, as they face away, have no noise. Empty where it is
+        known of none: then hidden points are as bright as those that are not, also those that face away.
     weight : (n_cells,)
     out : (n_cells,) float64, changed
         Of the cells of `runs`: variance of the weighted sum of the three channels.
     """
     for i in prange(len(runs)):
         run = np.int64(runs[i])
-        n_clear, n_rays, light = _clear_rays(run * per_run, min((run + 1) * per_run, len(of_patches)), of_patches)
-        p, mean = n_clear / n_rays, light / max(n_clear, 1)
+        last_of_run = min((run + 1) * per_run, len(of_patches))
+        n_clear, n_rays, n_bright, light = _clear_rays(run * per_run, last_of_run, of_patches, whole)
+        p, mean = (n_clear + 0.5) / (n_rays + 1.0), light / max(n_bright, 1)
         for cell in range(begin[run], end[run]):
             # A cell that the run before has a part of is that one's, if it was looked at.
             first, last = cell_begin[cell], cell_begin[cell + 1]
@@ -146,19 +151,24 @@ def shadow_noise_of_cells(
                 first = run * per_run
             if last > (run + 1) * per_run and looked_at[run + 1] == 0:
                 last = (run + 1) * per_run
-            clear, rays, level = _clear_rays(first, last, of_patches)
-            if clear + p > 0.0:
-                level = (level + p * mean) / (clear + p)
+            clear, rays, bright, level = _clear_rays(first, last, of_patches, whole)
+            if rays > 0:
+                level = level / bright if bright > 0 else mean
                 hidden = (clear + p) * (rays - clear + 1.0 - p) / ((rays + 1.0) * (rays + 2.0))
-                out[cell] = (weight[cell] * level) ** 2 * hidden / rays
+                out[cell] = (weight[cell] * level / (last - first)) ** 2 * hidden * rays
 
 
 @kernel
-def _clear_rays(first: int, last: int, of_patches: np.ndarray) -> tuple[int, int, float]:
-    """How many patch points from one to another see light, how many there are, and what all see."""
-    n, light = 0, 0.0
+def _clear_rays(first: int, last: int, of_patches: np.ndarray, whole: np.ndarray) -> tuple[int, int, int, float]:
+    """Of patch points from one to another: how many see light, and how many may; of how many is known how much they
+    may see, and how much all these may.
+    """
+    n_clear, n_rays, n_bright, light = 0, 0, 0, 0.0
     for patch in range(first, last):
         level = _level(of_patches, patch)
-        n += 1 if level > 0.0 else 0
-        light += level
-    return n, last - first, light
+        most = level if len(whole) == 0 or whole[patch] <= 0.0 else np.float64(whole[patch])
+        n_clear += 1 if level > 0.0 else 0
+        n_rays += 1 if most > 0.0 or len(whole) == 0 else 0
+        n_bright += 1 if most > 0.0 else 0
+        light += most
+    return n_clear, n_rays, n_bright, light

@@ -8,7 +8,7 @@ from icheat_usd.kernels import even_look
 from icheat_usd.kernels.clear_light import RECTANGLE
 from icheat_usd.lighting.controls import darken
 from icheat_usd.lighting.quick import Places, Shadows, Shining
-from icheat_usd.scene import F32, I32, SceneSnapshot
+from icheat_usd.scene import F32, I64, SceneSnapshot
 
 
 def can_look_evenly(snapshot: SceneSnapshot, shining: Shining) -> bool:
@@ -23,19 +23,20 @@ def look_evenly(
     shining: Shining,
     seed: int,
     n_rays: int,
-    runs: I32,
+    sequence: I64,
     out: F32,
 ) -> None:
-    """Light of a one-light snapshot that places of some runs reflect, for `can_look_evenly`; `n_rays` of each.
+    """Light of a one-light snapshot that places reflect, for `can_look_evenly`; `n_rays` of each.
 
     Parameters
     ----------
     snapshot, shadows, places, shining
-        As `quick.direct_at` has them.
-    runs : (n_runs,)
+        As `quick.direct_at` has them; places in their own order, as `diffuse_places` has them.
+    sequence : (n, 2)
+        A number that the rays of each place go by, and which of the rays of that number are its first: a place that
+        is there twice may have twice as many.
     out : (n, 3), changed
-        In the points' order. Places that the light has no closed form for, or that look through something, keep what
-        they have.
+        Places that look through something keep what they have.
     """
     function, opaque = shadows.opaque.address_of("rtcOccluded16")
     passing = 0 if shadows.passing is None else shadows.passing.address_of("rtcOccluded16")[1]
@@ -50,8 +51,7 @@ def look_evenly(
         n_rays,
         seed,
         *places.table,
-        places.row,
-        runs,
+        sequence,
         float(snapshot.controls(0).diffuse),
         out,
     )

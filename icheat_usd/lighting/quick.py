@@ -193,13 +193,14 @@ def prepare_places(
 
 
 def diffuse_places(places: Places, which: I64) -> Places:
-    """Some of the places (n,), in runs of their own, but without their lobes; rows stay those of the same points."""
+    """Some of the places (n,), once or several times each, in runs of their own, but without their lobes."""
     surface = _in_lines((-(-len(which) // RUN) * SPECULAR, RUN)).reshape(-1, SPECULAR, RUN)
     copy_places(*places.table, which, surface)
     column = np.zeros((len(surface), COLUMNS), np.int32)
     column[:, :SPECULAR] = np.arange(len(surface) * SPECULAR).reshape(-1, SPECULAR)
     lobes, bounds = np.zeros(len(surface), np.bool_), _bounds(surface[:, :SHADING])
-    return Places(places.row[which], places.instance, bounds, surface.reshape(-1, RUN), column, lobes)
+    row, instance = np.arange(len(which), dtype=np.int32), places.instance[places.row[which]]
+    return Places(row, instance, bounds, surface.reshape(-1, RUN), column, lobes)
 
 
 def _share_columns(tables: Sequence[F32]) -> tuple[F32, list[I32]]:

@@ -13,6 +13,7 @@ from icheat_usd.kernels.closer_look import (
     take_closer_looks,
     weighted_light,
 )
+from icheat_usd.kernels.even_look import light_of_clear_places
 from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.kernels.rows import mean_over_segments
 from icheat_usd.kernels.workers import take_back
@@ -30,13 +31,19 @@ MOST_RUNS_OF_SUN = 1536
 N_BESIDE, BESIDE = 7, 0.1
 #: Of these, the runs with most noise of shadows, such as those next to a small light, are looked at so many times.
 WORST_RUNS, TURNS = 16, 4
-#: At a rectangle so many cells are instead, by so many rays of each patch point, spread over what that sees of it.
-WORST_CELLS, N_EVEN = 256, 4
+#: At a rectangle so many cells are instead, by so many rays of each patch point, spread over what that sees of it; or
+#: fewer cells several times, up to `MOST_LOOKS`, the noisier the more.
+WORST_CELLS, N_EVEN, MOST_LOOKS = 256, 4, 16
 #: Noise of all cells, beside all light of theirs, below which no run is worth a look; and what looks may leave of more.
 #: Light that lies on many cells averages: at .0015 an image was .4 % off, at .0065, from a sun in a window, 22 %.
 LITTLE_NOISE, LEFT_NOISE, LEFT_NOISE_OF_SUN = 2e-3, 5e-4, 2e-4
 #: What looks at the worst cells may leave of it, by what the view gets from each.
 LEFT_NOISE_OF_SHADOWS = 1e-4
+
+# A cell whose share is less than this of one look gets none.
+_LEAST_LOOKS = 0.7
+
+_NOTHING = np.empty(0, np.float32)
 
 
 class CloserLook:
@@ -59,6 +66,7 @@ class CloserLook:
         self._last = LastLook(patches)
         self._looked_at = np.zeros(len(first), np.uint8)
         self._found: F32 = np.empty((patches.n, 3), np.float32)
+        self._whole: F32 = np.empty(len(first) * RUN, np.float32)
         self._noise_of_cells, self._run_of_cell = np.zeros(gather.n), gather.cell_begin[:-1] // RUN
         self._known: F32 | None = None  # of all cells, from when each was looked at closely for the last time
 
@@ -74,6 +82,7 @@ class CloserLook:
         shining: Shining,
         direct: F32,
         told: I32 | None = None,
+        influence: F32 | None = None,
     ) -> None:
         """Make the light of noisy cells that of their patch points.
 
@@ -85,8 +94,13 @@ class CloserLook:
             From one look at each cell.
         told
             As `direct_at` has it.
+        influence : (n_cells,), optional
+            Of the cells on the view, if that is known. Areas, and what the view receives from each, stand for it else.
         """
-        runs = (self._border_runs if shining.distant else self._noisy_runs)(direct)
+        area, importance = self._gather.area, self._gather.importance
+        if influence is not None and not shining.distant:
+            area = importance = influence
+        runs = self._border_runs(direct) if shining.distant else self._noisy_runs(direct, area)
         before, self._looked_at = self._looked_at, np.zeros_like(self._looked_at)
         self._looked_at[runs] = 1
         # What was not looked at in the frame before may be far from what it was.
@@ -100,11 +114,12 @@ class CloserLook:
         self._take(runs, direct)
         take_back()
         # Few cells next to a light, from which the view gets much, may have most of what is wrong in an image.
-        noise, left = self._noise_of_shadows(
-            direct, runs, self._gather.area if shining.distant else self._gather.importance
-        )
+        noise, left = self._noise_of_shadows(direct, runs, shining, area if shining.distant else importance)
         if can_look_evenly(alone, shining):
-            self._look_evenly(alone, shadows, seed, shining, _largest_but(noise, WORST_CELLS, left), direct)
+            cells = _largest_but(noise, WORST_CELLS, left)
+            n_looks = share_out_looks(np.sqrt(noise[cells]), WORST_CELLS)
+            order = np.argsort(cells[n_looks > 0])
+            self._look_evenly(alone, shadows, seed, shining, cells[order], n_looks[order], direct)
         else:
             of_runs = np.bincount(self._run_of_cell, noise, len(self._begin)).astype(np.float64)
             worst = np.sort(runs[_largest_but(of_runs[runs], WORST_RUNS, left)])
@@ -114,22 +129,25 @@ class CloserLook:
             copy_runs(runs, self._begin, self._end, direct, self._known)
 
     def _look_evenly(
-        self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, cells: I64, direct: F32
+        self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, cells: I64, n_looks: I64, direct: F32
     ) -> None:
-        """Make the light of some cells what `N_EVEN` rays say of each patch point that was looked at."""
+        """Make the light of some cells (n,) what so many times `N_EVEN` rays say of each patch point looked at."""
         if not len(cells):
             return
-        cells = np.sort(cells)
         which, ends = self._gather.patches_of(cells)
         # Of a cell between two runs one part may not have been looked at, of which nothing is known.
         is_known = self._looked_at[which // RUN] != 0
-        ends = np.concatenate([[0], np.cumsum(np.add.reduceat(is_known, ends[:-1], dtype=np.int64))])
-        which = which[is_known]
+        n_of_patch = np.repeat(n_looks, np.diff(ends)) * is_known
+        first = np.cumsum(n_of_patch) - n_of_patch
+        ends = np.append(first[ends[:-1]], n_of_patch.sum())
+        which = np.repeat(which, n_of_patch)
+        turn = np.arange(len(which)) - np.repeat(first, n_of_patch)
+        found = self._found[which]
         places = diffuse_places(self._patches, which)
-        every = np.arange(places.n_runs, dtype=np.int32)
-        look_evenly(alone, shadows, places, shining, seed, N_EVEN, every, self._found)
+        sequence = np.stack([which, N_EVEN * turn], axis=1)
+        look_evenly(alone, shadows, places, shining, seed, N_EVEN, sequence, found)
         means = np.empty((len(cells), 3), np.float32)
-        mean_over_segments(ends, self._found[which], means)
+        mean_over_segments(ends, found, means)
         direct[cells] = means
 
     def _look_again(self, alone: SceneSnapshot, shadows: Shadows, seed: int, shining: Shining, runs: I32) -> None:
@@ -150,9 +168,9 @@ class CloserLook:
         noise_of_runs(direct, weight, self._begin, self._end, found)
         return found[0], float(found[1].sum())
 
-    def _noisy_runs(self, direct: F32) -> I32:
-        """Runs that are worth a look, ascending."""
-        noise, light = self._noise(direct, self._gather.area)
+    def _noisy_runs(self, direct: F32, weight: F32) -> I32:
+        """Runs that are worth a look, by a weight of cells (n_cells,), ascending."""
+        noise, light = self._noise(direct, weight)
         most = _worth_a_look(noise, MOST_RUNS, light, LEFT_NOISE)
         # Beside what is seen to differ lies what one look has missed, such as the border of a shadow.
         wanted = np.zeros(len(noise) + 2, np.bool_)
@@ -172,21 +190,51 @@ class CloserLook:
         noise += BESIDE * noise[self._beside].mean(axis=1)
         return np.sort(_worth_a_look(noise, MOST_RUNS_OF_SUN, light, LEFT_NOISE_OF_SUN)).astype(np.int32)
 
-    def _noise_of_shadows(self, direct: F32, runs: I32, weight: F32) -> tuple[F64, float]:
+    def _noise_of_shadows(self, direct: F32, runs: I32, shining: Shining, weight: F32) -> tuple[F64, float]:
         """Squared noise (n_cells,) of shadows in cells of some runs, just looked at; and what may be left of it.
 
         Both by a weight of cells (n_cells,).
         """
-        noise = self._noise_of_cells
+        noise, found, whole = self._noise_of_cells, self._found, _NOTHING
         noise[:] = 0.0
-        shadow_noise_of_cells(
-            runs, self._begin, self._end, self._gather.cell_begin, RUN, self._looked_at, self._found, weight, noise
-        )
+        if len(shining.form):
+            whole = self._whole
+            light_of_clear_places(shining.form, *self._patches.table, runs, whole)
+        cells = self._begin, self._end, self._gather.cell_begin
+        shadow_noise_of_cells(runs, *cells, RUN, self._looked_at, found, whole, weight, noise)
         return noise, (LEFT_NOISE_OF_SHADOWS * weighted_light(direct, weight)) ** 2
 
     def _take(self, runs: I32, direct: F32) -> None:
         cells = self._begin, self._end, self._gather.cell_begin
         take_closer_looks(runs, *cells, RUN, self._looked_at, self._found, direct)
+
+
+def share_out_looks(noise: F64, n: int) -> I64:
+    """How often each of some cells is looked at, so that about `n` looks in all leave least noise.
+
+    Parameters
+    ----------
+    noise : (n_cells,)
+        Root mean square of each after one ray of every patch point, largest first.
+
+    Returns
+    -------
+    (n_cells,) int64
+        Powers of two up to `MOST_LOOKS`, or 0: by the noise (Neyman 1934, of strata), as far as they are that.
+    """
+    if not len(noise):
+        return np.empty(0, np.int64)
+    share = noise / noise[0]
+    # The more looks the noisiest has, the more have others: up to where all are `n`.
+    most = np.exp2(np.arange(0.0, np.log2(MOST_LOOKS * 256.0), 0.25))
+    wanted = most[:, None] * share
+    looks = np.exp2(np.minimum(np.rint(np.log2(np.maximum(wanted, _LEAST_LOOKS))), np.log2(MOST_LOOKS)))
+    looks[wanted < _LEAST_LOOKS] = 0
+    fits = np.flatnonzero(looks.sum(axis=1) <= n)
+    if not len(fits):  # too many are as noisy as the first
+        return (np.arange(len(noise)) < n).astype(np.int64)
+    found: I64 = looks[fits[-1]].astype(np.int64)
+    return found
 
 
 def runs_beside(places: F32) -> I64:

@@ -106,6 +106,7 @@ class Surroundings:
 
     seed: int
     sparse: SparseView | None = None
+    influence: F32 | None = None  #: (n_gather,) of the cells on the view, `transport.influence`, once that is known
     #: Of cells and view, once a dome asks for them; by what the domes' controls say.
     _skies: dict[tuple[bytes, bytes], list[SeenSky]] = field(default_factory=dict)
     _others: dict[bytes, Shadows] = field(default_factory=dict)  #: without what does not block some lights
@@ -414,7 +415,7 @@ class MovingLight:
         look = Look(self._alone, shadows, tiles, self._shining, self._seed, True, view_direct, 0, before, told)
 
         def work() -> None:
-            closer.improve(self._alone, shadows, self._seed, self._shining, direct, told)
+            closer.improve(self._alone, shadows, self._seed, self._shining, direct, told, around.influence)
             at_cells()
 
         beside(work, look.pieces())

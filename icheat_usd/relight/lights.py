@@ -31,7 +31,8 @@ from icheat_usd.samples import GatherSamples, ViewSamples
 from icheat_usd.scene import F32, LightKind, SceneSnapshot
 from icheat_usd.steps import Steps
 from icheat_usd.tracing import Tracer
-from icheat_usd.transport import Bounces, CellLight, sum_lights
+from icheat_usd.transport import Bounces, CellLight, Transport, sum_lights
+from icheat_usd.transport.influence import influence_on_view
 
 # Light of all cells alike, in means of a light that rests, that rows of bounces on the move are made for: what is dark
 # now may be lit once a light moves. As much as all lights have, where these are more.
@@ -66,6 +67,8 @@ class LiveLights:
         Shadow rays per light and point at rest; domes get four times as many by default.
     sparse : SparseView, optional
         For a first look: domes light these view samples, diffusely, and the others follow from them.
+    rows : Transport, optional
+        Of the view: what cells are looked at closely goes by what they bring to it, from when the lights first rest.
     """
 
     def __init__(
@@ -81,6 +84,7 @@ class LiveLights:
         dome_samples: int | None = None,
         seed: int = 0,
         sparse: SparseView | None = None,
+        rows: Transport | None = None,
     ) -> None:
         self._scene, self._seed, self._images = snapshot, seed, LightImages(snapshot.textures)
         self._light_samples, self._dome_samples = light_samples, dome_samples
@@ -97,6 +101,7 @@ class LiveLights:
         self.view_direct: F32 = np.zeros((n, view.n, 3), np.float32)  #: (n_lights, n_view, 3) at gain 1
         self._suiting: Steps[None] | None = None  # of quick bounces to the lights, once these rest
         self._suited = False  # whether that was done since one of them changed
+        self._weighing = None if rows is None else influence_on_view(rows)  # until it is done
         for light in range(n):
             self._show(light)
 
@@ -233,7 +238,17 @@ class LiveLights:
                 self.revision += 1
                 self.moves = state.moved = self.moves + 1
                 return True
-        return self._suit_bounces()
+        return self._weigh_cells() or self._suit_bounces()
+
+    def _weigh_cells(self) -> bool:
+        """One step of finding what each cell brings to the view; False when that is known."""
+        if self._weighing is None:
+            return False
+        try:
+            next(self._weighing)
+        except StopIteration as end:
+            self._around.influence, self._weighing = end.value, None
+        return True
 
     def _suit_bounces(self) -> bool:
         """One step of making rows of which these lights, and what is like them, has little noise; False when done."""

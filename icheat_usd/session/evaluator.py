@@ -42,6 +42,7 @@ class Evaluator:
         sparse = None
         if is_coarse and isinstance(transport, Transport) and transport.interpolation is not None:
             sparse = SparseView(transport.row_view, transport.interpolation)
+        rows = transport if isinstance(transport, Transport) else transport.source
         self._snapshot = parts.snapshot
         self.lights = LiveLights(
             parts.snapshot,
@@ -54,8 +55,8 @@ class Evaluator:
             dome_samples=quality.dome_samples,
             seed=quality.seed,
             sparse=sparse,
+            rows=None if is_coarse else rows,
         )
-        rows = transport if isinstance(transport, Transport) else transport.source
         held_back = None
         if rows is not None:
             held_back = HeldBack(parts.snapshot, parts.tracer, parts.view, parts.gather, rows)

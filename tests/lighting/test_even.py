@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from icheat_usd.kernels.even_look import light_of_clear_places
+from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.lighting import build_light_sampler, irradiance
 from icheat_usd.lighting.even import can_look_evenly, look_evenly
 from icheat_usd.lighting.quick import build_shadows, diffuse_places, direct_at, prepare_places, shining_points
 from icheat_usd.materials import take_points
-from icheat_usd.scene import F32, LightKind, SceneSnapshot, SurfacePoints
+from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot, SurfacePoints
 from tests.lighting.test_quick import LIGHTS, on_floor, tracer_of
 from tests.scenes import Light, Material, Mesh, make_snapshot, quad, quads, rotation, translation
 
@@ -26,9 +28,12 @@ def even(snapshot: SceneSnapshot, points: SurfacePoints, seed: int, n_rays: int,
     places = prepare_places(snapshot, points, points.albedo, None)
     found = np.full((len(points.instance), 3), before, np.float32)
     shadows, shining = build_shadows(snapshot, tracer_of(snapshot)), shining_points(snapshot, 7, by_form=True)
-    runs = np.arange(places.n_runs, dtype=np.int32)
-    look_evenly(snapshot, shadows, places, shining, seed, n_rays, runs, found)
+    look_evenly(snapshot, shadows, places, shining, seed, n_rays, each_once(places.n), found)
     return found
+
+
+def each_once(n: int) -> I64:
+    return np.stack([np.arange(n), np.zeros(n, np.int64)], axis=1)
 
 
 def expected(snapshot: SceneSnapshot, points: SurfacePoints, n_rays: int = 4096) -> F32:
@@ -90,20 +95,56 @@ def test_places_behind_glass_keep_what_they_have() -> None:
     assert np.count_nonzero(kept) > 20
 
 
-def test_some_of_the_places_see_what_they_see_among_all() -> None:
+def test_without_a_closed_form_rays_alone_tell() -> None:
+    """Where the horizon of a bent surface cuts the light, and nothing is lost in the mean."""
+    snapshot = room(Light(LightKind.RECT, (3, 2, 1), translation(0.0, 0.1, 0.5)[:3], (1.0, 1.0)))
+    points = on_floor(snapshot, 500)
+    bent = points.normal + np.float32([0.0, 0.0, 0.5])
+    bent /= np.linalg.norm(bent, axis=1, keepdims=True)
+    points = points._replace(shading_normal=bent)
+    places = prepare_places(snapshot, points, points.albedo, None)
+    whole = np.empty(places.n_runs * RUN, np.float32)
+    form = shining_points(snapshot, 7, by_form=True).form
+    light_of_clear_places(form, *places.table, np.arange(places.n_runs, dtype=np.int32), whole)
+    exact = expected(snapshot, points)
+    has_none = np.flatnonzero((whole[:500] == 0.0) & (exact[:, 0] > 0.0))
+    assert len(has_none) > 100
+    evenly = [even(snapshot, points, seed, 16)[has_none] for seed in range(16)]
+    assert off(evenly[0], exact[has_none]) < 0.2
+    assert off(np.mean(evenly, axis=0), exact[has_none]) < 0.02
+
+
+def test_light_of_clear_places_is_what_they_get_if_nothing_hides_it() -> None:
+    snapshot, hidden = room(LIGHTS["rect"]), room(LIGHTS["rect"], Mesh(SCREEN, Material(0.5)))
+    points = on_floor(snapshot, 300)
+    places = prepare_places(hidden, points, points.albedo, None)
+    whole = np.full(places.n_runs * RUN, -1.0, np.float32)
+    form = shining_points(hidden, 7, by_form=True).form
+    light_of_clear_places(form, *places.table, np.array([0, 2, 4], np.int32), whole)
+    wanted = np.isin(np.arange(len(whole)) // RUN, (0, 2, 4))
+    exact = np.pad(expected(snapshot, points).sum(axis=1), (0, len(whole) - 300))
+    # Of the mean of the channels, as the light's colour is of mean 1.
+    np.testing.assert_allclose(whole[wanted], exact[wanted], rtol=2e-3)
+    assert (whole[~wanted] == -1.0).all()
+
+
+def test_places_may_be_there_several_times_with_other_rays() -> None:
+    """Some of all see what they see among all, and more rays tell more."""
     snapshot = room(LONG, Mesh(SCREEN, Material(0.5)))
     points = on_floor(snapshot, 500)
     places = prepare_places(snapshot, points, points.albedo, None)
-    which = np.random.default_rng(8).choice(500, 200, replace=False)
+    which = np.repeat(np.random.default_rng(8).choice(500, 200, replace=False), 4)
     some = diffuse_places(places, which)
-    assert some.n == 200 and some.n_runs == 4
-    found = np.zeros((500, 3), np.float32)
+    assert some.n == 800 and some.n_runs == 13
+    found = np.zeros((800, 3), np.float32)
     shadows, shining = build_shadows(snapshot, tracer_of(snapshot)), shining_points(snapshot, 7, by_form=True)
-    look_evenly(snapshot, shadows, some, shining, 5, 4, np.arange(4, dtype=np.int32), found)
-    among_all = even(snapshot, points, 5, 4)
+    sequence = np.stack([which, np.arange(800) % 4 * 4], axis=1)
+    look_evenly(snapshot, shadows, some, shining, 5, 4, sequence, found)
+    among_all, exact = even(snapshot, points, 5, 4)[which[::4]], expected(snapshot, points)[which[::4]]
     # What all of the light brings is rounded otherwise beside other places.
-    np.testing.assert_allclose(found[which], among_all[which], rtol=1e-3)
-    assert not np.delete(found, which, axis=0).any() and np.count_nonzero(among_all[which]) > 150
+    np.testing.assert_allclose(found[::4], among_all, rtol=1e-3)
+    assert np.count_nonzero(among_all) > 150
+    assert off(found.reshape(200, 4, 3).mean(axis=1), exact) < 0.5 * off(among_all, exact)
 
 
 def test_other_lights_are_not_looked_at_so() -> None:

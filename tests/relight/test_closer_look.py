@@ -15,8 +15,9 @@ from icheat_usd.kernels.closer_look import (
     weighted_light,
 )
 from icheat_usd.kernels.place_columns import RUN
+from icheat_usd.lighting.quick import shining_points
 from icheat_usd.relight import closer_look
-from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside
+from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside, share_out_looks
 from icheat_usd.relight.lights import LiveLights
 from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot
 from tests.pipeline import Pipeline
@@ -143,17 +144,18 @@ def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lights._around.patches is not None
     look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
     even = np.ones((pipeline.gather.n, 3), np.float32)
-    assert len(look._noisy_runs(even)) == len(look._border_runs(even)) == 0
-    look._looked_at[:4], look._found[:] = 1, 1.0
-    noise, left = look._noise_of_shadows(even, np.arange(4, dtype=np.int32), pipeline.gather.importance)
-    assert noise.sum() == 0.0 < left
-    look._found[::3] = 0.0
-    noise, left = look._noise_of_shadows(even, np.arange(4, dtype=np.int32), pipeline.gather.importance)
-    assert noise.sum() > left and np.count_nonzero(noise) > 4
+    assert len(look._noisy_runs(even, pipeline.gather.area)) == len(look._border_runs(even)) == 0
+    look._looked_at[:4], look._found[:], noise = 1, 0.0, []
+    shining, runs = shining_points(pipeline.snapshot, 0), np.arange(4, dtype=np.int32)
+    for hidden in (range(look._patches.n), (), range(0, look._patches.n, 3)):
+        look._found[:], look._found[list(hidden)] = 1.0, 0.0
+        of_cells, left = look._noise_of_shadows(even, runs, shining, pipeline.gather.importance)
+        noise.append(of_cells.sum())
+    assert noise[0] == 0.0 < left**2 < 0.03 * noise[2] and noise[1] < 0.01 * noise[2]
     monkeypatch.setattr(closer_look, "MOST_RUNS", 2)
     spotted = even.copy()
     spotted[::50] = 9.0
-    assert 2 < len(look._noisy_runs(spotted)) <= 6
+    assert 2 < len(look._noisy_runs(spotted, pipeline.gather.area)) <= 6
 
 
 @pytest.mark.parametrize(("light", "limit", "part"), [(GRAZING, "WORST_CELLS", 0.4), (SUNK, "WORST_RUNS", 0.8)])
@@ -185,7 +187,8 @@ def cells_in_runs(rng: np.random.Generator) -> tuple[I64, I64, I64, int]:
     return cell_begin, begin, end, per_run
 
 
-def test_noise_of_shadows_is_that_of_a_plain_loop() -> None:
+@pytest.mark.parametrize("is_whole_known", [False, True])
+def test_noise_of_shadows_is_that_of_a_plain_loop(is_whole_known: bool) -> None:
     """The mean of p (1 - p) over a beta distribution; of cells between two runs what was looked at counts."""
     rng = np.random.default_rng(6)
     cell_begin, begin, end, per_run = cells_in_runs(rng)
@@ -193,28 +196,50 @@ def test_noise_of_shadows_is_that_of_a_plain_loop() -> None:
     of_patches = rng.random((n, 3)).astype(np.float32)
     of_patches[rng.random(n) < 0.4] = 0.0
     runs = np.array([1, 2, 4, 5, 6, len(begin) - 1], np.int32)
-    # All of one run are in sight, and none of another: no noise but in what is in a run beside it, too.
+    # All of one run are in sight, and none of another.
     of_patches[5 * per_run : 6 * per_run], of_patches[1 * per_run : 2 * per_run] = 1.0, 0.0
+    whole = np.where(rng.random(n) < 0.7, rng.uniform(1, 5, n), 0.0).astype(np.float32)
     looked_at = np.zeros(len(begin), np.uint8)
     looked_at[runs] = 1
     weight, found = rng.random(40).astype(np.float32), np.zeros(40)
-    shadow_noise_of_cells(runs, begin, end, cell_begin, per_run, looked_at, of_patches, weight, found)
+    given = whole if is_whole_known else whole[:0]
+    shadow_noise_of_cells(runs, begin, end, cell_begin, per_run, looked_at, of_patches, given, weight, found)
+
+    level = of_patches.sum(axis=1, dtype=np.float64)
+    is_clear = level > 0
+    most = np.where(whole > 0, whole, level) if is_whole_known else level
+    has_ray = most > 0 if is_whole_known else np.ones(n, np.bool_)
     for cell in range(40):
         mine = np.arange(cell_begin[cell], cell_begin[cell + 1])
         mine = mine[looked_at[mine // per_run] > 0]
-        expected = 0.0
-        if len(mine):
-            level = of_patches.sum(axis=1, dtype=np.float64)
-            of_run = level[mine[0] // per_run * per_run :][:per_run]
-            share = np.mean(of_run > 0)
-            clear, rays = np.count_nonzero(level[mine]), len(mine)
-            a, b = clear + share, rays - clear + 1 - share
-            if a > 0 and b > 0:
-                of_all = of_run[of_run > 0].mean() if share > 0 else 0.0
-                light = (level[mine].sum() + share * of_all) / a
-                expected = (weight[cell] * light) ** 2 * stats.beta(a, b).expect(lambda p: p * (1 - p)) / rays
+        expected, rays = 0.0, np.count_nonzero(has_ray[mine])
+        if rays:
+            of_run = np.arange(mine[0] // per_run * per_run, min(n, (mine[0] // per_run + 1) * per_run))
+            share = (np.count_nonzero(is_clear[of_run]) + 0.5) / (np.count_nonzero(has_ray[of_run]) + 1)
+            clear, bright = np.count_nonzero(is_clear[mine]), mine if (most[mine] > 0).any() else of_run
+            light = most[bright][most[bright] > 0].mean() if (most[bright] > 0).any() else 0.0
+            hidden = stats.beta(clear + share, rays - clear + 1 - share).expect(lambda p: p * (1 - p))
+            expected = (weight[cell] * light) ** 2 * hidden * rays / len(mine) ** 2
         np.testing.assert_allclose(found[cell], expected, rtol=1e-5, atol=1e-12)
     assert np.count_nonzero(found) > 8
+
+
+def test_looks_are_shared_out_so_that_least_noise_is_left() -> None:
+    """Less than with as many looks at each of any number of the noisiest cells."""
+    noise = np.sort(np.random.default_rng(3).lognormal(0.0, 2.0, 200))[::-1]
+    looks = share_out_looks(noise, 64)
+    assert 48 < looks.sum() <= 64 and looks.max() == closer_look.MOST_LOOKS and (np.diff(looks) <= 0).all()
+    assert set(looks) <= {0, 1, 2, 4, 8, 16}
+
+    def left(looks: I64) -> float:
+        """Of variance; one ray of each patch point was sent before."""
+        return float((noise**2 / np.maximum(looks * closer_look.N_EVEN, 1)).sum())
+
+    for each in (1, 2, 4, 8, 16):
+        assert left(looks) < left(np.where(np.arange(200) < 64 // each, each, 0))
+    assert (share_out_looks(np.ones(10), 20) == 2).all()
+    assert (share_out_looks(np.ones(10), 1000) == closer_look.MOST_LOOKS).all()
+    assert not len(share_out_looks(np.empty(0), 64)) and share_out_looks(np.ones(10), 5).tolist() == [1] * 5 + [0] * 5
 
 
 def test_light_of_all_cells_is_their_weighted_sum() -> None:

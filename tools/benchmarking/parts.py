@@ -120,6 +120,7 @@ class Parts:
             light_samples=quality.light_samples,
             dome_samples=quality.dome_samples,
             seed=quality.seed,
+            rows=self.transport,
         )
         lights.take_bounces(self._shot.rest_bounces)
         return lights
