@@ -69,8 +69,8 @@ def look_evenly(
     """
     for run in prange(len(column)):
         _look_at_run(
-            function, opaque, passing, boxes, lights, form, color, n_rays, seed, columns, column, sequence, run,
-            diffuse, out,
+            function, opaque, passing, boxes, lights, form, color, n_rays, seed, columns, column, sequence,
+            np.int64(run), diffuse, out,
         )  # fmt: skip
 
 

@@ -19,7 +19,10 @@ from icheat_usd.lighting.quick import shining_points
 from icheat_usd.relight import closer_look
 from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside, share_out_looks
 from icheat_usd.relight.lights import LiveLights
-from icheat_usd.scene import F32, I64, LightKind, SceneSnapshot
+from icheat_usd.scene import F32, I64, Bool, LightKind, SceneSnapshot
+from icheat_usd.steps import all_steps
+from icheat_usd.transport import Transport
+from icheat_usd.transport.influence import influence_on_view
 from tests.pipeline import Pipeline
 from tests.scenes import Light, cornell_meshes, look_at, make_snapshot, rotation, translation
 
@@ -37,10 +40,10 @@ def room(light: Light) -> SceneSnapshot:
     return make_snapshot(cornell_meshes(), lights=[light], camera=look_at((0, 0, 3.9), fov=39.3, width=16, height=12))
 
 
-def first_look(pipeline: Pipeline, seed: int) -> LiveLights:
+def first_look(pipeline: Pipeline, seed: int, rows: Transport | None = None) -> LiveLights:
     return LiveLights(
         pipeline.snapshot, pipeline.tracer, pipeline.view, pipeline.gather, pipeline.bounces, n_bounces=4,
-        light_samples=16, seed=seed,
+        light_samples=16, seed=seed, rows=rows,
     )  # fmt: skip
 
 
@@ -175,6 +178,30 @@ def test_cells_in_part_of_whose_light_something_stands_are_looked_at_again(
             found.append(error(direct, lights._lights[0].direct, importance))
     without, with_them = map(np.mean, errors.values())
     assert with_them < part * without
+
+
+def test_once_lights_have_rested_looks_go_by_what_the_image_shows() -> None:
+    """If half of the cells are said to be out of sight, these are left alone."""
+    pipeline = Pipeline(room(GRAZING), n_gather=2048, rays=128)
+    lights = first_look(pipeline, 0, pipeline.transport)
+    assert lights._around.influence is None
+    while lights.refine():
+        pass
+    influence = lights._around.influence
+    assert influence is not None and np.array_equal(influence, all_steps(influence_on_view(pipeline.transport)))
+
+    def noisy_cells(is_seen: Bool) -> Bool:
+        lights._around.influence = is_seen.astype(np.float32)
+        lights.change(0, to_world=GRAZING.to_world)
+        following = lights._lights[0].following
+        assert following is not None and following.patches is not None
+        return following.patches._noise_of_cells > 0.0
+
+    every = noisy_cells(np.ones(2048, np.bool_))
+    half = np.cumsum(every) < np.count_nonzero(every) // 2
+    for is_seen in (half, ~half):
+        found = noisy_cells(is_seen)
+        assert np.count_nonzero(found) > 50 and not found[~is_seen].any()
 
 
 def cells_in_runs(rng: np.random.Generator) -> tuple[I64, I64, I64, int]:
