@@ -55,6 +55,10 @@ _SMOOTH = 0.3
 
 _RAYS_PER_STEP = 1 << 16  # of the general way
 
+# Cells next to a light have most of its light and of its noise: they get up to so many times the rounds, if that is no
+# more rays in all than this.
+_MORE_NEAR, _RAYS_NEAR = 4, 1 << 20
+
 # Places nearer to a light than so many of its extents are lit by what samples solid angles: of points spread evenly
 # over a light, those next to a place are too few and too bright.
 _NEAR = 1.0
@@ -356,6 +360,7 @@ class MovingLight:
         self._shining = shining_points(alone, seed, by_form=True)
         self._step = self._n_found = self._n_near = 0
         self._near: I64 | None = None  # cells next to the light, from the last round on
+        self._n_rays_near = light_samples  # of each of their patch points
         #: View samples next to it or with narrow lobes, and how many rays these get, once the bounces are done.
         self._exposed: list[tuple[I64, int]] | None = None
         self._n_at_grain = light_samples  # rounds at what is grainy, those at all view samples among them
@@ -464,20 +469,24 @@ class MovingLight:
 
     def _light_near_cells(self) -> bool:
         """Light some of the cells next to the light in the general way; False once all are."""
-        gather, n = self._around.gather, self._rounds
+        gather = self._around.gather
+        size = np.diff(gather.cell_begin)
         if self._near is None:
             self._near = np.flatnonzero(_is_near(gather.points.position, self._shining))
             self._sampler = build_light_sampler(self._alone)
-        first = self._n_near
+            n_rays = max(1, int(size[self._near].sum())) * self._rounds
+            self._n_rays_near = self._rounds * max(1, min(_MORE_NEAR, _RAYS_NEAR // n_rays))
+        first, n = self._n_near, self._n_rays_near
         if first >= len(self._near):
             return False
         assert self._sampler is not None
-        ends = np.cumsum(np.diff(gather.cell_begin)[self._near[first:]])
+        ends = np.cumsum(size[self._near[first:]])
         some = self._near[first : first + max(1, int(np.searchsorted(ends, _RAYS_PER_STEP // n)))]
         self._n_near += len(some)
         seed = int(hash_combine(self._seed, first)) & 0x7FFFFFFF
         # as the sum of all rounds
-        self._cells[some] = self._around.lit_cells(self._alone, self._sampler, some, seed, n) * np.float32(n)
+        found = self._around.lit_cells(self._alone, self._sampler, some, seed, n)
+        self._cells[some] = found * np.float32(self._rounds)
         return True
 
     def _light_grain(self, view_direct: F32) -> bool:
