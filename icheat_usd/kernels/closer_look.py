@@ -129,10 +129,11 @@ def shadow_noise_of_cells(
     ----------
     runs, begin, end, cell_begin, per_run, looked_at, of_patches
         As `take_closer_looks` has them; no cell has as many patch points as a run.
-    whole : (n_patches,) float32
+    whole : (n_patches or more,) float32
         What each patch point of `runs` reflects of the light if nothing hides it, the sum of the channels; 0 where
-        that is not known. Those that get no light either way, as they face away, have no noise. Empty where it is
-        known of none: then hidden points are as bright as those that are not, also those that face away.
+        that is not known. Those that get no light either way have no noise: they face away, or are hidden where the
+        light has no closed form, of which too little noise is told then. Empty where it is known of none: then hidden
+        points are as bright as those that are not, also those that face away.
     weight : (n_cells,)
     out : (n_cells,) float64, changed
         Of the cells of `runs`: variance of the weighted sum of the three channels.

@@ -20,12 +20,12 @@ from numba import prange
 from icheat_usd.kernels._jit import kernel, parallel_kernel
 from icheat_usd.kernels.clear_light import clear_light
 from icheat_usd.kernels.embree import PACKET
-from icheat_usd.kernels.light_geometry import Floats, rect_frame, world_frame
+from icheat_usd.kernels.light_geometry import Floats, plane_axes, rect_frame, world_frame
 from icheat_usd.kernels.lights import place_in_rect
 from icheat_usd.kernels.place_columns import COLUMNS, NORMAL, ORIGIN, RUN, SHADING, TINT
 from icheat_usd.kernels.place_rays import CLEAR, THROUGH, find_columns, prepare_packet, trace_rows
 from icheat_usd.kernels.random import hash_combine, sobol_pair
-from icheat_usd.kernels.simd import address_of, load, plus, product, store
+from icheat_usd.kernels.simd import address_of, load, multiply_add, product, spread, store
 
 
 @parallel_kernel
@@ -76,22 +76,28 @@ def look_evenly(
 
 @parallel_kernel
 def light_of_clear_places(
-    form: np.ndarray, columns: np.ndarray, column: np.ndarray, wanted: np.ndarray, out: np.ndarray
-) -> None:
+    form: np.ndarray, color: np.ndarray, columns: np.ndarray, column: np.ndarray, wanted: np.ndarray, diffuse: float,
+    out: np.ndarray,
+) -> None:  # fmt: skip
     """What places of some runs reflect of a light that nothing hides, diffusely, the sum of the channels.
 
     Parameters
     ----------
     form, columns, column, wanted
         As `shadow.light_places` has them.
+    color, diffuse
+        As `look_evenly` has them.
     out : (n_runs * RUN,) float32, changed
-        In the places' order; 0 where the light has no closed form.
+        In the places' order, where they are of the runs; 0 where the light has no closed form.
     """
     for i in prange(len(wanted)):
         at, run = np.empty(COLUMNS, np.int64), np.int64(wanted[i])
         find_columns(address_of(columns), column, run, at)
         for lane in range(0, RUN, 16):
-            tint = plus(plus(load(at[TINT] + lane * 4), load(at[TINT + 1] + lane * 4)), load(at[TINT + 2] + lane * 4))
+            tint = product(spread(np.float32(diffuse * color[0])), load(at[TINT] + lane * 4))
+            for c in range(1, 3):
+                channel = load(at[TINT + c] + lane * 4)
+                tint = multiply_add(spread(np.float32(diffuse * color[c])), channel, tint)
             store(address_of(out) + (run * RUN + lane) * 4, product(tint, clear_light(form, at, lane)))
 
 
@@ -129,7 +135,7 @@ def _look_at_run(  # type: ignore[no-untyped-def]
             total += weight[r, j]
             seen += weight[r, j] if state[r, j] == CLEAR else 0.0
             is_through |= weight[r, j] > 0.0 and state[r, j] == THROUGH
-        if total > 0.0 and not is_through:
+        if (total > 0.0 or whole[j] <= 0.0) and not is_through:
             light = whole[j] * seen / total if whole[j] > 0.0 else abs(form[1]) / math.pi * measure[j] * seen / n_rays
             for c in range(3):
                 out[run * RUN + j, c] = np.float32(diffuse * light * columns[column[run, TINT + c], j] * color[c])
@@ -174,7 +180,7 @@ def _aim(  # type: ignore[no-untyped-def]
         ways[r, 0, j], ways[r, 1, j], ways[r, 2, j] = dx, dy, dz
         rows[n] = r * RUN + j
         n += 1
-    return n, solid_angle if solid_angle > 0.0 else frame[0] * frame[1]
+    return n, solid_angle if solid_angle > 0.0 else plane_axes(m)[9] * width * height
 
 
 @kernel

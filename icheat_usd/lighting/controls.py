@@ -34,7 +34,7 @@ def lit_instances(snapshot: SceneSnapshot, light: int, instance: I32) -> I32:
 
 
 def darken(snapshot: SceneSnapshot, light: int, instance: I32, values: F32) -> None:
-    """Set rows of `values` (n, 3) to 0 where a light does not shine on a point's instance (n,)."""
+    """Set rows of `values` (n, ...) to 0 where a light does not shine on a point's instance (n,)."""
     lit = receives(snapshot, light, instance)
     if lit is not None:
         values[~lit] = 0.0

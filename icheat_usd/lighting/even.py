@@ -34,7 +34,8 @@ def look_evenly(
         As `quick.direct_at` has them; places in their own order, as `diffuse_places` has them.
     sequence : (n, 2)
         A number that the rays of each place go by, and which of the rays of that number are its first: a place that
-        is there twice may have twice as many.
+        is there twice may have twice as many. Each time it gets a light of its own, so that their mean has what bias
+        a ratio of `n_rays` has: half a percent with four.
     out : (n, 3), changed
         Places that look through something keep what they have.
     """

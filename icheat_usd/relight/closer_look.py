@@ -17,6 +17,7 @@ from icheat_usd.kernels.even_look import light_of_clear_places
 from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.kernels.rows import mean_over_segments
 from icheat_usd.kernels.workers import take_back
+from icheat_usd.lighting.controls import darken
 from icheat_usd.lighting.even import can_look_evenly, look_evenly
 from icheat_usd.lighting.quick import LastLook, Places, Shadows, Shining, diffuse_places, direct_at
 from icheat_usd.samples import GatherSamples
@@ -114,7 +115,7 @@ class CloserLook:
         self._take(runs, direct)
         take_back()
         # Few cells next to a light, from which the view gets much, may have most of what is wrong in an image.
-        noise, left = self._noise_of_shadows(direct, runs, shining, area if shining.distant else importance)
+        noise, left = self._noise_of_shadows(alone, direct, runs, shining, area if shining.distant else importance)
         if can_look_evenly(alone, shining):
             cells = _largest_but(noise, WORST_CELLS, left)
             n_looks = share_out_looks(np.sqrt(noise[cells]), WORST_CELLS)
@@ -190,18 +191,22 @@ class CloserLook:
         noise += BESIDE * noise[self._beside].mean(axis=1)
         return np.sort(_worth_a_look(noise, MOST_RUNS_OF_SUN, light, LEFT_NOISE_OF_SUN)).astype(np.int32)
 
-    def _noise_of_shadows(self, direct: F32, runs: I32, shining: Shining, weight: F32) -> tuple[F64, float]:
+    def _noise_of_shadows(
+        self, alone: SceneSnapshot, direct: F32, runs: I32, shining: Shining, weight: F32
+    ) -> tuple[F64, float]:
         """Squared noise (n_cells,) of shadows in cells of some runs, just looked at; and what may be left of it.
 
         Both by a weight of cells (n_cells,).
         """
-        noise, found, whole = self._noise_of_cells, self._found, _NOTHING
+        noise, controls, whole = self._noise_of_cells, alone.controls(0), _NOTHING
         noise[:] = 0.0
-        if len(shining.form):
+        if len(shining.form) and controls.shaping is None:
             whole = self._whole
-            light_of_clear_places(shining.form, *self._patches.table, runs, whole)
+            color = np.ascontiguousarray(shining.table[0, 6:9])
+            light_of_clear_places(shining.form, color, *self._patches.table, runs, float(controls.diffuse), whole)
+            darken(alone, 0, self._patches.instance, whole[: self._patches.n])
         cells = self._begin, self._end, self._gather.cell_begin
-        shadow_noise_of_cells(runs, *cells, RUN, self._looked_at, found, whole, weight, noise)
+        shadow_noise_of_cells(runs, *cells, RUN, self._looked_at, self._found, whole, weight, noise)
         return noise, (LEFT_NOISE_OF_SHADOWS * weighted_light(direct, weight)) ** 2
 
     def _take(self, runs: I32, direct: F32) -> None:
@@ -210,7 +215,7 @@ class CloserLook:
 
 
 def share_out_looks(noise: F64, n: int) -> I64:
-    """How often each of some cells is looked at, so that about `n` looks in all leave least noise.
+    """How often each of some cells is looked at, so that at most `n` looks in all leave least noise.
 
     Parameters
     ----------
@@ -225,10 +230,10 @@ def share_out_looks(noise: F64, n: int) -> I64:
     if not len(noise):
         return np.empty(0, np.int64)
     share = noise / noise[0]
-    # The more looks the noisiest has, the more have others: up to where all are `n`.
-    most = np.exp2(np.arange(0.0, np.log2(MOST_LOOKS * 256.0), 0.25))
+    # The more looks the noisiest would have, the more have others.
+    most = np.exp2(np.arange(0.0, np.log2(MOST_LOOKS * WORST_CELLS + 1.0), 0.25))
     wanted = most[:, None] * share
-    looks = np.exp2(np.minimum(np.rint(np.log2(np.maximum(wanted, _LEAST_LOOKS))), np.log2(MOST_LOOKS)))
+    looks = np.exp2(np.minimum(np.rint(np.log2(np.maximum(wanted, 1.0))), np.log2(MOST_LOOKS)))
     looks[wanted < _LEAST_LOOKS] = 0
     fits = np.flatnonzero(looks.sum(axis=1) <= n)
     if not len(fits):  # too many are as noisy as the first

@@ -475,7 +475,9 @@ class MovingLight:
             self._near = np.flatnonzero(_is_near(gather.points.position, self._shining))
             self._sampler = build_light_sampler(self._alone)
             n_rays = max(1, int(size[self._near].sum())) * self._rounds
-            self._n_rays_near = self._rounds * max(1, min(_MORE_NEAR, _RAYS_NEAR // n_rays))
+            more = max(1, min(_MORE_NEAR, _RAYS_NEAR // n_rays))
+            # Rays of a power of two are spread best.
+            self._n_rays_near = self._rounds * (1 << (more.bit_length() - 1))
         first, n = self._n_near, self._n_rays_near
         if first >= len(self._near):
             return False

@@ -101,7 +101,7 @@ class LiveLights:
         self.view_direct: F32 = np.zeros((n, view.n, 3), np.float32)  #: (n_lights, n_view, 3) at gain 1
         self._suiting: Steps[None] | None = None  # of quick bounces to the lights, once these rest
         self._suited = False  # whether that was done since one of them changed
-        self._weighing = None if rows is None else influence_on_view(rows)  # until it is done
+        self._weighing = None if rows is None else influence_on_view(rows, gather.importance)  # until it is done
         for light in range(n):
             self._show(light)
 

@@ -104,14 +104,28 @@ def test_without_a_closed_form_rays_alone_tell() -> None:
     points = points._replace(shading_normal=bent)
     places = prepare_places(snapshot, points, points.albedo, None)
     whole = np.empty(places.n_runs * RUN, np.float32)
+    runs, white = np.arange(places.n_runs, dtype=np.int32), np.ones(3, np.float32)
     form = shining_points(snapshot, 7, by_form=True).form
-    light_of_clear_places(form, *places.table, np.arange(places.n_runs, dtype=np.int32), whole)
+    light_of_clear_places(form, white, *places.table, runs, 1.0, whole)
     exact = expected(snapshot, points)
     has_none = np.flatnonzero((whole[:500] == 0.0) & (exact[:, 0] > 0.0))
     assert len(has_none) > 100
-    evenly = [even(snapshot, points, seed, 16)[has_none] for seed in range(16)]
-    assert off(evenly[0], exact[has_none]) < 0.2
+    # What they had before has no part in it, also where all of the few rays are below the horizon.
+    evenly = [even(snapshot, points, seed, 4, before=9.0)[has_none] for seed in range(64)]
+    assert off(evenly[0], exact[has_none]) < 0.3
     assert off(np.mean(evenly, axis=0), exact[has_none]) < 0.02
+    assert np.mean(evenly, axis=0).sum() == pytest.approx(exact[has_none].sum(), rel=0.01)
+
+
+def test_a_skewed_rectangle_is_as_large_as_it_is() -> None:
+    """Beyond 32 of its diagonals no closed form is used."""
+    skew = np.array([[1, 0.8, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
+    light = translation(0.0, 2.5, 0.0) @ rotation((1, 0, 0), -90) @ np.vstack([skew, [0, 0, 0, 1]])
+    snapshot = room(Light(LightKind.RECT, (300, 200, 100), light[:3], (0.03, 0.03)))
+    points = on_floor(snapshot, 300)
+    exact = expected(snapshot, points)
+    assert exact.min() > 0.0
+    np.testing.assert_allclose(even(snapshot, points, 1, 64, before=9.0), exact, rtol=0.01)
 
 
 def test_light_of_clear_places_is_what_they_get_if_nothing_hides_it() -> None:
@@ -119,11 +133,11 @@ def test_light_of_clear_places_is_what_they_get_if_nothing_hides_it() -> None:
     points = on_floor(snapshot, 300)
     places = prepare_places(hidden, points, points.albedo, None)
     whole = np.full(places.n_runs * RUN, -1.0, np.float32)
-    form = shining_points(hidden, 7, by_form=True).form
-    light_of_clear_places(form, *places.table, np.array([0, 2, 4], np.int32), whole)
+    shining = shining_points(hidden, 7, by_form=True)
+    color, runs = np.ascontiguousarray(shining.table[0, 6:9]), np.array([0, 2, 4], np.int32)
+    light_of_clear_places(shining.form, color, *places.table, runs, 0.5, whole)
     wanted = np.isin(np.arange(len(whole)) // RUN, (0, 2, 4))
-    exact = np.pad(expected(snapshot, points).sum(axis=1), (0, len(whole) - 300))
-    # Of the mean of the channels, as the light's colour is of mean 1.
+    exact = np.pad(0.5 * expected(snapshot, points).sum(axis=1), (0, len(whole) - 300))
     np.testing.assert_allclose(whole[wanted], exact[wanted], rtol=2e-3)
     assert (whole[~wanted] == -1.0).all()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -15,11 +17,12 @@ from icheat_usd.kernels.closer_look import (
     weighted_light,
 )
 from icheat_usd.kernels.place_columns import RUN
+from icheat_usd.lighting.change import one_light
 from icheat_usd.lighting.quick import shining_points
 from icheat_usd.relight import closer_look
 from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside, share_out_looks
 from icheat_usd.relight.lights import LiveLights
-from icheat_usd.scene import F32, I64, Bool, LightKind, SceneSnapshot
+from icheat_usd.scene import F32, I64, Bool, LightControls, LightKind, SceneSnapshot
 from icheat_usd.steps import all_steps
 from icheat_usd.transport import Transport
 from icheat_usd.transport.influence import influence_on_view
@@ -148,17 +151,65 @@ def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
     even = np.ones((pipeline.gather.n, 3), np.float32)
     assert len(look._noisy_runs(even, pipeline.gather.area)) == len(look._border_runs(even)) == 0
-    look._looked_at[:4], look._found[:], noise = 1, 0.0, []
-    shining, runs = shining_points(pipeline.snapshot, 0), np.arange(4, dtype=np.int32)
-    for hidden in (range(look._patches.n), (), range(0, look._patches.n, 3)):
-        look._found[:], look._found[list(hidden)] = 1.0, 0.0
-        of_cells, left = look._noise_of_shadows(even, runs, shining, pipeline.gather.importance)
-        noise.append(of_cells.sum())
-    assert noise[0] == 0.0 < left**2 < 0.03 * noise[2] and noise[1] < 0.01 * noise[2]
     monkeypatch.setattr(closer_look, "MOST_RUNS", 2)
     spotted = even.copy()
     spotted[::50] = 9.0
     assert 2 < len(look._noisy_runs(spotted, pipeline.gather.area)) <= 6
+
+
+@pytest.mark.parametrize("light", [SUN, SUNK, GRAZING])
+def test_noise_is_where_something_hides_the_light(light: Light) -> None:
+    """None where no light gets, little where all rays are clear."""
+    pipeline = Pipeline(room(light), n_gather=512)
+    lights = first_look(pipeline, 0)
+    assert lights._around.patches is not None
+    look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
+    alone, shining = one_light(pipeline.snapshot, 0), shining_points(pipeline.snapshot, 0, by_form=True)
+    runs, even = np.arange(look._patches.n_runs, dtype=np.int32), np.ones((pipeline.gather.n, 3), np.float32)
+    given = alone, even, runs, shining, pipeline.gather.importance
+    look._looked_at[:], look._found[:], noise = 1, 0.0, []
+    of_cells = look._noise_of_shadows(*given)[0].copy()
+    clear = look._whole[: look._patches.n, None] if len(shining.form) else np.float32(1.0)
+    for hidden in ((), range(0, look._patches.n, 3)):
+        look._found[:] = clear
+        look._found[list(hidden)] = 0.0
+        found, left = look._noise_of_shadows(*given)
+        noise.append(found.sum())
+    assert 0.0 < left < noise[1] and noise[0] < 0.05 * noise[1]
+    # Where the light has a closed form, what faces away is known from what is hidden.
+    if not len(shining.form):
+        assert not of_cells.any()
+        return
+    towards = np.array(light.to_world)[:3, 3] - pipeline.gather.patch_points.position
+    faces = np.einsum("ij,ij->i", towards, pipeline.gather.patch_points.normal) > 0.0
+    of_cell = np.logical_or.reduceat(faces, pipeline.gather.cell_begin[:-1])
+    assert np.count_nonzero(~of_cell) > 20 < np.count_nonzero(of_cells)
+    far = light.kind == LightKind.RECT  # parts of it may be above a horizon that its middle is below
+    assert far or not of_cells[~of_cell].any()
+
+
+def test_noise_is_of_what_a_light_is_told_to_bring() -> None:
+    """A quarter of the light has a quarter of the noise, and what is not lit has none."""
+    pipeline = Pipeline(room(GRAZING), n_gather=512)
+    lights = first_look(pipeline, 0)
+    assert lights._around.patches is not None
+    look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
+    plain, shining = one_light(pipeline.snapshot, 0), shining_points(pipeline.snapshot, 0, by_form=True)
+    runs, even = np.arange(look._patches.n_runs, dtype=np.int32), np.ones((pipeline.gather.n, 3), np.float32)
+    receivers = (np.arange(plain.n_instances) % 2).astype(np.uint8)
+    look._looked_at[:], look._found[:] = 1, 0.0
+    whole, quarter, part = (
+        look._noise_of_shadows(alone, even, runs, shining, pipeline.gather.importance)[0].copy()
+        for alone in (
+            plain,
+            replace(plain, light_controls=(LightControls(diffuse=0.25),)),
+            replace(plain, light_controls=(LightControls(receivers=receivers),)),
+        )
+    )
+    np.testing.assert_allclose(quarter, whole / 16.0, rtol=1e-5)
+    is_lit = receivers[pipeline.gather.points.instance] > 0
+    assert np.count_nonzero(whole[~is_lit]) > 20 < np.count_nonzero(part)
+    assert not part[~is_lit].any()
 
 
 @pytest.mark.parametrize(("light", "limit", "part"), [(GRAZING, "WORST_CELLS", 0.4), (SUNK, "WORST_RUNS", 0.8)])
@@ -188,7 +239,9 @@ def test_once_lights_have_rested_looks_go_by_what_the_image_shows() -> None:
     while lights.refine():
         pass
     influence = lights._around.influence
-    assert influence is not None and np.array_equal(influence, all_steps(influence_on_view(pipeline.transport)))
+    assert influence is not None and np.array_equal(
+        influence, all_steps(influence_on_view(pipeline.transport, pipeline.gather.importance))
+    )
 
     def noisy_cells(is_seen: Bool) -> Bool:
         lights._around.influence = is_seen.astype(np.float32)
