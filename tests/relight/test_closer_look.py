@@ -18,11 +18,11 @@ from icheat_usd.kernels.closer_look import (
 )
 from icheat_usd.kernels.place_columns import RUN
 from icheat_usd.lighting.change import one_light
-from icheat_usd.lighting.quick import shining_points
+from icheat_usd.lighting.quick import Shining, shining_points
 from icheat_usd.relight import closer_look
 from icheat_usd.relight.closer_look import N_BESIDE, CloserLook, runs_beside, share_out_looks
 from icheat_usd.relight.lights import LiveLights
-from icheat_usd.scene import F32, I64, Bool, LightControls, LightKind, SceneSnapshot
+from icheat_usd.scene import F32, I32, I64, Bool, LightControls, LightKind, SceneSnapshot
 from icheat_usd.steps import all_steps
 from icheat_usd.transport import Transport
 from icheat_usd.transport.influence import influence_on_view
@@ -157,17 +157,23 @@ def test_little_noise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 2 < len(look._noisy_runs(spotted, pipeline.gather.area)) <= 6
 
 
-@pytest.mark.parametrize("light", [SUN, SUNK, GRAZING])
-def test_noise_is_where_something_hides_the_light(light: Light) -> None:
-    """None where no light gets, little where all rays are clear."""
+def dark_look(light: Light) -> tuple[Pipeline, CloserLook, tuple[SceneSnapshot, F32, I32, Shining, F32]]:
+    """All runs of a room are looked at and no ray gets through; and what `CloserLook._noise_of_shadows` is given."""
     pipeline = Pipeline(room(light), n_gather=512)
     lights = first_look(pipeline, 0)
     assert lights._around.patches is not None
     look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
+    look._looked_at[:], look._found[:] = 1, 0.0
     alone, shining = one_light(pipeline.snapshot, 0), shining_points(pipeline.snapshot, 0, by_form=True)
     runs, even = np.arange(look._patches.n_runs, dtype=np.int32), np.ones((pipeline.gather.n, 3), np.float32)
-    given = alone, even, runs, shining, pipeline.gather.importance
-    look._looked_at[:], look._found[:], noise = 1, 0.0, []
+    return pipeline, look, (alone, even, runs, shining, pipeline.gather.importance)
+
+
+@pytest.mark.parametrize("light", [SUN, SUNK, GRAZING])
+def test_noise_is_where_something_hides_the_light(light: Light) -> None:
+    """None where no light gets, little where all rays are clear."""
+    pipeline, look, given = dark_look(light)
+    shining, noise = given[3], []
     of_cells = look._noise_of_shadows(*given)[0].copy()
     clear = look._whole[: look._patches.n, None] if len(shining.form) else np.float32(1.0)
     for hidden in ((), range(0, look._patches.n, 3)):
@@ -190,16 +196,10 @@ def test_noise_is_where_something_hides_the_light(light: Light) -> None:
 
 def test_noise_is_of_what_a_light_is_told_to_bring() -> None:
     """A quarter of the light has a quarter of the noise, and what is not lit has none."""
-    pipeline = Pipeline(room(GRAZING), n_gather=512)
-    lights = first_look(pipeline, 0)
-    assert lights._around.patches is not None
-    look = CloserLook(lights._around.patches, pipeline.gather, lights._around.beside)
-    plain, shining = one_light(pipeline.snapshot, 0), shining_points(pipeline.snapshot, 0, by_form=True)
-    runs, even = np.arange(look._patches.n_runs, dtype=np.int32), np.ones((pipeline.gather.n, 3), np.float32)
+    pipeline, look, (plain, *given) = dark_look(GRAZING)
     receivers = (np.arange(plain.n_instances) % 2).astype(np.uint8)
-    look._looked_at[:], look._found[:] = 1, 0.0
     whole, quarter, part = (
-        look._noise_of_shadows(alone, even, runs, shining, pipeline.gather.importance)[0].copy()
+        look._noise_of_shadows(alone, *given)[0].copy()
         for alone in (
             plain,
             replace(plain, light_controls=(LightControls(diffuse=0.25),)),
